@@ -1,0 +1,1 @@
+"""The kernel: declarations, components, the network, assembly, stepping, configuration and records."""

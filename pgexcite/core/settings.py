@@ -1,0 +1,29 @@
+"""How a run is integrated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Rule = Literal["tr_bdf2", "trapezoidal", "backward_euler"]
+Compile = Literal["auto", "never", "always"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a run.
+
+    Attributes:
+        t_end: simulated time, s.
+        h: step, s.
+        rule: integration rule.
+        compile: whether the step is compiled to C: ``"auto"`` where a compiler is found, ``"never"``, or ``"always"``, which
+            fails where there is none.
+        delta_max_deg: a rotor angle beyond this from the reference, degrees, is a loss of synchronism.
+    """
+
+    t_end: float
+    h: float = 0.005
+    rule: Rule = "tr_bdf2"
+    compile: Compile = "auto"
+    delta_max_deg: float = 180.0

@@ -1,0 +1,1 @@
+"""What runs many simulations, or looks at finished ones: clearing times, equal areas, comparisons."""
