@@ -127,7 +127,7 @@ def _entries(role: str) -> dict[str, list[EntryPoint]]:
 def _load(role: str, item: EntryPoint) -> type[Any]:
     try:
         cls = item.load()
-    except Exception as cause:  # noqa: BLE001 - importing someone else's module may raise anything; it is named and reported
+    except Exception as cause:  # importing someone else's module may raise anything
         raise RegistryError(
             f"the {role} {item.name!r} of {_owner(item)} cannot be loaded from {item.value}: {type(cause).__name__}: {cause}; "
             "repair or uninstall that distribution"

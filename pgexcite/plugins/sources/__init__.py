@@ -1,0 +1,1 @@
+"""Sources that stand for the rest of the grid."""
