@@ -1,0 +1,151 @@
+"""What a recording shows: single-line diagram, capability curves, curves against time, events, controller diagnostics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pgexcite.core import recording
+from pgexcite.core.recording import Colour, colour, entity
+from pgexcite.core.system import Device, System
+from pgexcite.core.trace import Trace
+from pgexcite.plugins.sinks.capability_view import CapabilityView
+from pgexcite.plugins.sinks.single_line_view import SingleLineView
+
+LOG = "/log"
+DEGREES = "degrees"
+"""Prefix of the rotor angles shown to people; everything else is shown as it stands in the trace."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A plot of the overview: its title, and the signals of every unit in it with their names."""
+
+    title: str
+    signals: tuple[tuple[str, str], ...]
+
+
+QUANTITIES = (
+    Quantity("Rotor angle δ [deg]", (("delta", "δ"),)),
+    Quantity("Rotor speed ω [pu]", (("omega", "ω"),)),
+    Quantity("Terminal voltage V_t [pu]", (("v_t", "V_t"),)),
+    Quantity("Field voltage E_fd and current i_fd [pu]", (("e_fd", "E_fd"), ("i_fd", "i_fd"))),
+    Quantity("Active power P [pu of the machine]", (("p_e", "P"),)),
+    Quantity("Reactive power Q [pu of the machine]", (("q_e", "Q"),)),
+)
+DIAGNOSTICS = {"cost": "cost [-]", "solve_ms": "solve time [ms]"}
+"""Controller signals with a plot in the overview, where the trace has them."""
+
+
+@dataclass(frozen=True)
+class Overview:
+    """The layout of one system's recording, and what it takes to fill it."""
+
+    system: System
+    signals: frozenset[str]
+
+    @classmethod
+    def of(cls, system: System, signals: Iterable[str]) -> Overview:
+        """For a system and the paths of the signals there will be."""
+        return cls(system, frozenset(signals))
+
+    @cached_property
+    def units(self) -> tuple[Device, ...]:
+        return tuple(device for device in self.system.devices if device.path.startswith("unit."))
+
+    @cached_property
+    def capability(self) -> CapabilityView:
+        return CapabilityView([d for d in self.units if {f"{d.path}.p_e", f"{d.path}.q_e"} <= self.signals])
+
+    @cached_property
+    def single_line(self) -> SingleLineView:
+        return SingleLineView(self.system, self.signals)
+
+    def blueprint(self) -> Any:
+        """The layout: grid on the left, curves on the right, log below, components on a second tab."""
+        import rerun.blueprint as rrb
+
+        curves = [
+            recording.plot(quantity.title, [path for path, _, _ in series])
+            for quantity, series in self._curves()
+        ] + self._diagnostics()
+        left = rrb.Vertical(
+            self.single_line.view(), *self.capability.views(), row_shares=[2, *[3] * bool(self.capability.units)]
+        )
+        log = recording.text_log("Events", [LOG])
+        right = rrb.Vertical(rrb.Grid(*curves, grid_columns=2), log, row_shares=[5, 1])
+        overview = rrb.Horizontal(left, right, column_shares=[2, 3], name="Overview")
+        inside = self._component_plots()
+        tabs = [overview, rrb.Grid(*inside, grid_columns=2, name="Components")] if inside else [overview]
+        return recording.blueprint(rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else overview)
+
+    def draw_fixed(self, stream: Any) -> None:
+        """Send what does not change: names, colours, diagram, capability curves."""
+        for _, series in self._curves():
+            for path, name, rgb in series:
+                recording.style(stream, path, name, rgb)
+        for k, path in enumerate(sorted(self.signals)):
+            slot, _, name = path.rpartition(".")
+            if slot.count(".") == 2 or slot.startswith("controller."):
+                recording.style(stream, entity(path), f"{slot.split('.')[1]} {name}", colour(k))
+        self.single_line.draw_fixed(stream)
+        self.capability.draw_fixed(stream)
+
+    def send(self, stream: Any, trace: Trace, first: int = 0) -> None:
+        """Send samples; ``first`` is the index of the first one in the whole run."""
+        columns = {entity(path): samples for path, samples in trace.columns.items()}
+        for device in self.units:
+            path = f"{device.path}.delta"
+            if path in trace.columns:
+                columns[entity(path, DEGREES)] = np.degrees(trace[path])
+        recording.send_scalars(stream, columns, trace.t, first)
+        recording.send_log(stream, LOG, trace.log, trace.t)
+        shown = frames(trace)
+        self.single_line.send(stream, trace, shown, first)
+        self.capability.send(stream, trace, shown, first)
+
+    def _curves(self) -> list[tuple[Quantity, list[tuple[str, str, Colour]]]]:
+        """The plots with anything in them, each with (entity, name, colour) of its series."""
+        found = []
+        for quantity in QUANTITIES:
+            series = []
+            for k, device in enumerate(self.units):
+                for shade, (signal, label) in enumerate(quantity.signals):
+                    path = f"{device.path}.{signal}"
+                    if path in self.signals:
+                        where = entity(path, DEGREES) if signal == "delta" else entity(path)
+                        series.append((where, f"{device.name} {label}", colour(k + shade * 5)))
+            if series:
+                found.append((quantity, series))
+        return found
+
+    def _diagnostics(self) -> list[Any]:
+        found = sorted(path for path in self.signals if path.startswith("controller."))
+        return [
+            recording.plot(f"Controllers: {title}", [entity(path) for path in paths])
+            for name, title in DIAGNOSTICS.items()
+            if (paths := [path for path in found if path.endswith(f".{name}")])
+        ]
+
+    def _component_plots(self) -> list[Any]:
+        """A plot per component of a unit and per controller: states, set-points, everything a person may want to look into."""
+        slots: dict[str, list[str]] = {}
+        for path in sorted(self.signals):
+            slot = path.rpartition(".")[0]
+            if (slot.startswith("unit.") and slot.count(".") == 2) or slot.startswith("controller."):
+                slots.setdefault(slot, []).append(entity(path))
+        return [recording.plot(" ".join(slot.split(".")[1:]), paths) for slot, paths in slots.items()]
+
+
+def frames(trace: Trace, spacing: float = 0.02) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Indices of the samples drawn as pictures: one in ``spacing`` seconds, both sides of every event, and the last."""
+    t = trace.t
+    keep = np.zeros(len(t), dtype=bool)
+    keep[np.unique(np.floor((t - t[0]) / spacing + 1e-6), return_index=True)[1]] = True
+    twin = np.flatnonzero(np.diff(t) == 0)
+    keep[twin] = keep[twin + 1] = keep[-1] = True
+    return np.flatnonzero(keep)
