@@ -1,0 +1,146 @@
+"""Checks across the tables of a scenario: names that refer to nothing, networks that hang in the air, sampling that does not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, get_args
+
+from pydantic import BaseModel
+
+from pgexcite.core import registry
+from pgexcite.core.config.validate import Collector
+from pgexcite.core.declare import Kind
+from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, LoadStep, ParameterStep
+from pgexcite.core.network import Branch
+from pgexcite.core.system import Device, System
+
+EVENTS: dict[str, type[BaseModel]] = {
+    name: cls for cls in get_args(get_args(Event)[0]) for name in get_args(cls.model_fields["type"].annotation)
+}
+"""Class of every type of event."""
+
+_FROM_REGISTRY = {"backend": "mpc_backend", "estimator": "estimator"}
+"""Fields of a controller that name another registered model, and the role it must have."""
+
+
+def islands(buses: Iterable[str], branches: Iterable[Branch]) -> list[tuple[str, ...]]:
+    """Buses in groups that branches in service hold together, in the order the buses came in."""
+    island = {name: {name} for name in buses}
+    for branch in branches:
+        if branch.status > 0 and branch.from_bus in island and branch.to_bus in island:
+            joined = island[branch.from_bus] | island[branch.to_bus]
+            island.update(dict.fromkeys(joined, joined))
+    groups = {id(members): members for members in island.values()}
+    return [tuple(name for name in island if name in members) for members in groups.values()]
+
+
+def check_islands(system: System, collect: Collector) -> None:
+    """Every island needs something that holds its angle, and as many voltages left free as a unit fixes too much."""
+    for members in islands(system.buses, system.branches().values()):
+        there = [device for device in system.devices if device.bus in members]
+        where = f"bus.{members[0]}"
+        if not any(device.schedule.angle is not None for device in there):
+            collect.add(
+                where,
+                f"the island of bus {', '.join(members)} has no infinite bus and no slack unit",
+                hint="connect it by a line or transformer in service, or set slack = true at one of its units",
+            )
+            continue
+        free = [device.path for device in there if device.schedule.angle is not None and device.schedule.V is None]
+        full = [device.path for device in there if _has_all(device)]
+        if len(free) != len(full):
+            collect.add(
+                where,
+                f"{_listed(free)} leave V out and {_listed(full)} have all of P, Q and V; there must be as many of these as of those",
+                hint="leave V out at one infinite bus for each unit that is given P, Q and V",
+            )
+
+
+def check_reference(reference: str, system: System, collect: Collector) -> None:
+    """The angle reference is a word or a unit that exists."""
+    units = [device.name for device in system.devices if device.path.startswith("unit.")]
+    if collect.known("unit, nor such a reference", reference, ["auto", "infinite_bus", "centre_of_inertia", *units], "simulation.reference"):
+        sources = [device for device in system.devices if device.path.startswith("infinite_bus.")]
+        if reference == "infinite_bus" and not sources:
+            collect.add("simulation.reference", "there is no infinite bus here", reference, "use centre_of_inertia or a unit")
+
+
+def check_event(event: BaseModel, where: str, system: System, collect: Collector) -> None:
+    """What an event refers to exists."""
+    if isinstance(event, Fault):
+        collect.known("bus", event.bus, system.buses, f"{where}.bus")
+    elif isinstance(event, BranchTrip | BranchClose):
+        kind = event.type.partition("_")[0]
+        collect.known(kind, event.name, system.lines if kind == "line" else system.transformers, f"{where}.name")
+    elif isinstance(event, LoadStep):
+        loads = [device.name for device in system.devices if device.path.startswith("load.")]
+        collect.known("load", event.load, loads, f"{where}.load")
+    elif isinstance(event, ParameterStep):
+        _check_parameter_step(event, where, system, collect)
+
+
+def check_controller(controller: BaseModel, where: str, system: System, h: float | None, collect: Collector) -> None:
+    """A controller's sample time fits the step, and the unit and models it names exist."""
+    dt = getattr(controller, "dt", None)
+    if isinstance(dt, float) and h is not None:
+        ratio = dt / h
+        if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+            fitting = max(1, round(ratio)) * h
+            collect.add(f"{where}.dt", f"must be a whole multiple of the step simulation.h = {h:g} s", dt, f"{fitting:g} would do")
+    units = [device.name for device in system.devices if device.path.startswith("unit.")]
+    if isinstance(unit := getattr(controller, "unit", None), str):
+        collect.known("unit", unit, units, f"{where}.unit")
+    for field, role in _FROM_REGISTRY.items():
+        if isinstance(name := getattr(controller, field, None), str):
+            collect.find(role, name, f"{where}.{field}")
+
+
+def adjustable(system: System) -> dict[str, tuple[BaseModel, str] | None]:
+    """Paths of everything an event may change: the record and field a parameter belongs to, or ``None`` for a set-point."""
+    found: dict[str, tuple[BaseModel, str] | None] = {}
+    network: dict[str, Any] = {f"bus.{name}": item for name, item in system.buses.items()}
+    network |= {f"shunt.{name}": item for name, item in system.shunts.items()} | system.branches()
+    for path, item in network.items():
+        found |= {f"{path}.{name}": (item, name) for name in item.numeric_parameters()}
+    for device in system.devices:
+        for slot, component in device.components.items():
+            path = device.component_path(slot)
+            found |= {f"{path}.{name}": (component, name) for name in component.numeric_parameters()}
+            found |= {f"{path}.{item.name}": None for item in component.variables(Kind.SETPOINT)}
+    return found
+
+
+def _check_parameter_step(event: ParameterStep, where: str, system: System, collect: Collector) -> None:
+    targets = adjustable(system)
+    if event.path not in targets:
+        hint = registry.nearest(event.path, _siblings(event.path, targets))
+        collect.add(f"{where}.path", "there is no such parameter or set-point", event.path, hint)
+        return
+    target = targets[event.path]
+    if target is None or event.value is None:
+        return
+    record, name = target
+    info = type(record).model_fields[name]
+    trial = Collector()
+    trial.validate(type(record), record.model_dump(by_alias=True) | {info.alias or name: event.value}, event.path)
+    for problem in trial.problems:
+        collect.add(f"{where}.value", f"{event.path} {problem.message}", event.value, problem.hint)
+
+
+def _siblings(path: str, targets: Mapping[str, object]) -> list[str]:
+    """Targets that share the longest leading part of a path, so that the list offered is a short one."""
+    parts = path.split(".")
+    for count in range(len(parts) - 1, 0, -1):
+        start = ".".join(parts[:count]) + "."
+        if found := [target for target in targets if target.startswith(start)]:
+            return found
+    return list(targets)
+
+
+def _has_all(device: Device) -> bool:
+    plan = device.schedule
+    return plan.P is not None and plan.Q is not None and plan.V is not None
+
+
+def _listed(paths: list[str]) -> str:
+    return ", ".join(paths) or "none"

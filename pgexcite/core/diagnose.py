@@ -1,0 +1,75 @@
+"""Why a step could not be taken: no algebraic solution any more (voltage collapse), or something else (divergence)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgexcite.core.model import Model, State
+from pgexcite.core.settings import Rule
+from pgexcite.core.stage import FROZEN
+from pgexcite.core.step import Kernel
+from pgexcite.core.trace import Ending, Outcome
+
+Array = NDArray[np.float64]
+
+_NEARLY_SINGULAR = 0.05
+"""Smallest singular value of the algebraic equations, against its value at the start of the run, that counts as singular."""
+
+
+def algebraic_jacobian(kernel: Kernel, state: State, p: Array) -> Array:
+    """``dg/dz`` with the algebraic rows of zero-mass states left out, shape ``(n_z, n_z)``."""
+    n_x = len(kernel.model.x_names)
+    w = np.concatenate((state.x, state.z))
+    jacobian = kernel.functions.residual(w, state.x, FROZEN, state.d, state.u, p)[1]
+    return np.array(jacobian.full())[n_x:, n_x:]
+
+
+def smallest_singular_value(kernel: Kernel, state: State, p: Array) -> float:
+    """Distance of the algebraic equations from having no unique solution."""
+    values = np.linalg.svd(algebraic_jacobian(kernel, state, p), compute_uv=False)
+    return float(values[-1]) if values.size else np.inf
+
+
+def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healthy: float) -> Outcome:
+    """Outcome for a run whose next step cannot be taken from ``state``.
+
+    Args:
+        healthy: ``smallest_singular_value`` at the start of the run.
+    """
+    last, fine = state, h / 64
+    while fine > h / 5000:
+        segment = kernel.advance(last, p, rule, fine, 64)
+        last = segment.state
+        if not segment.failed:
+            break
+        fine /= 8
+    jacobian = algebraic_jacobian(kernel, last, p)
+    settled = kernel.settle(last, p)
+    singular = np.linalg.svd(jacobian)
+    if settled is None or singular.S[-1] < _NEARLY_SINGULAR * healthy:
+        bus = _weakest_bus(kernel.model, singular.Vh[-1])
+        text = f"voltage collapse at bus {bus}: from t = {state.t:.4f} s on no voltage satisfies the network and its loads"
+        return Outcome(Ending.VOLTAGE_COLLAPSE, state.t, f"bus.{bus}", text)
+    worst = _worst_equation(kernel, last, p, h)
+    text = f"the step after t = {state.t:.4f} s has no solution; the equation furthest from being satisfied is that of {worst}"
+    return Outcome(Ending.DIVERGED, state.t, worst, text)
+
+
+def _weakest_bus(model: Model, direction: Array) -> str:
+    """The bus whose voltage moves most in the direction the equations no longer determine."""
+    size: dict[str, float] = {}
+    for path, component in zip(model.z_names, direction, strict=True):
+        if path.startswith("bus."):
+            name = path.removeprefix("bus.").rpartition(".")[0]
+            size[name] = size.get(name, 0.0) + component * component
+    return max(size, key=lambda name: size[name])
+
+
+def _worst_equation(kernel: Kernel, state: State, p: Array, h: float) -> str:
+    model = kernel.model
+    mass = np.array(model.dae(state.x, state.z, state.d, state.u, p, h)[1]).ravel()
+    w = np.concatenate((state.x, state.z))
+    r = np.array(kernel.functions.residual(w, mass * state.x, h, state.d, state.u, p)[0]).ravel()
+    r[~np.isfinite(r)] = np.inf
+    return str((*model.x_names, *model.z_names)[int(np.argmax(np.abs(r)))])

@@ -1,0 +1,389 @@
+"""A run: steps, events and controllers in order of time, recorded on both sides of every jump."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgexcite.core.controller import Controller, Plant, Sample, Session, Surroundings
+from pgexcite.core.diagnose import diagnose, smallest_singular_value
+from pgexcite.core.errors import ConfigError, Problem, SnapshotError
+from pgexcite.core.events import Change
+from pgexcite.core.initialise import Initial, initialise
+from pgexcite.core.model import Model, State
+from pgexcite.core.result import ControllerStatistics, RunResult
+from pgexcite.core.settings import Settings
+from pgexcite.core.step import Kernel
+from pgexcite.core.system import System
+from pgexcite.core.trace import Ending, LogEntry, Outcome, Trace
+
+Array = NDArray[np.float64]
+
+_CHUNK = 500
+"""Steps taken between two looks at the outcome; a run that ends inside a chunk is cut back to the sample where it ended."""
+
+
+@dataclass
+class _Recording:
+    """Blocks of consecutive samples; inside a block commands and parameters do not change."""
+
+    t: list[Array] = field(default_factory=list)
+    x: list[Array] = field(default_factory=list)
+    z: list[Array] = field(default_factory=list)
+    d: list[Array] = field(default_factory=list)
+    u: list[Array] = field(default_factory=list)
+    y: list[Array] = field(default_factory=list)
+    log: list[LogEntry] = field(default_factory=list)
+
+    def add(self, t: Array, x: Array, z: Array, d: Array, u: Array, y: Array) -> None:
+        self.t.append(t)
+        self.x.append(x)
+        self.z.append(z)
+        self.d.append(d)
+        self.u.append(np.broadcast_to(u, (t.size, u.size)))
+        self.y.append(y)
+
+
+@dataclass
+class _Running:
+    """A controller at work, and how it has done."""
+
+    controller: Controller
+    session: Session
+    every: int
+    measures: Array
+    names: tuple[str, ...]
+    t: list[float] = field(default_factory=list)
+    diagnostics: list[Mapping[str, float]] = field(default_factory=list)
+    solve_ms: list[float] = field(default_factory=list)
+    fallbacks: int = 0
+    cost: float = 0.0
+
+
+class Simulation:
+    """A system on its way through time.
+
+    Args:
+        system: what is simulated.
+        settings: step, rule, length.
+        changes: events, in any order.
+        controllers: by name.
+
+    Raises:
+        PowerFlowError, InitialisationError, AssemblyError: there is no steady state to start from.
+        ConfigError: an event or a controller refers to something that is not there.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        settings: Settings,
+        changes: Sequence[Change] = (),
+        controllers: Mapping[str, Controller] | None = None,
+    ) -> None:
+        self.settings = settings
+        self.initial: Initial = initialise(system)
+        self.model: Model = self.initial.model
+        self.kernel = Kernel(self.model, self.initial.state, self.initial.p, settings.compile)
+        self._controllers = dict(controllers or {})
+        self._healthy = smallest_singular_value(self.kernel, self.initial.state, self.initial.p)
+        self._angles = _Angles(self.model)
+        self.restart(changes)
+
+    def restart(self, changes: Sequence[Change] | None = None) -> None:
+        """Go back to the initial point, with other events where they are given; nothing is compiled again."""
+        if changes is not None:
+            self._changes = sorted(changes, key=lambda change: change.t)
+            self._check_changes()
+        self.state: State = self.initial.state
+        self.p: Array = self.initial.p.copy()
+        self.outcome: Outcome | None = None
+        self.wall_time = 0.0
+        self._pending = list(self._changes)
+        self._recording = _Recording()
+        self._running = {name: self._start(name, controller) for name, controller in self._controllers.items()}
+        self._record_point()
+
+    # Parameters and commands, at any time.
+
+    def get(self, path: str) -> float:
+        """Present value of a parameter, command, state, algebraic unknown or output.
+
+        Raises:
+            KeyError: no such path; the message names the nearest.
+        """
+        index = self.model.index
+        for group, values in (("p", self.p), ("u", self.state.u), ("x", self.state.x), ("z", self.state.z), ("d", self.state.d)):
+            if path in index[group]:
+                return float(values[index[group][path]])
+        state = self.state
+        y = self.kernel.outputs(state.x, state.z, state.d, state.u, self.p)
+        return float(y[self.model.position("y", path)])
+
+    def set(self, path: str, value: float) -> None:
+        """Change a parameter or command now; the algebraic unknowns are solved again and both sides are recorded.
+
+        Raises:
+            KeyError: no such parameter or command.
+        """
+        self._apply(Change(self.state.t, {path: value}, f"{path} set to {value:g}"))
+
+    # Running.
+
+    def run(self, until: float | None = None, progress: Callable[[float], None] | None = None) -> Outcome:
+        """Go on to ``until`` (s; the end of the run where left out).
+
+        Args:
+            progress: called with the simulated time now and then.
+        """
+        h = self.settings.h
+        k_end = round((self.settings.t_end if until is None else until) / h)
+        began = time.perf_counter()
+        while not self._ended() and self.state.k < k_end:
+            self._apply_due()
+            if self._ended():
+                break
+            self._control()
+            if self._ended():
+                break
+            self._advance(min(k_end, self._next_stop()) - self.state.k)
+            if progress is not None:
+                progress(self.state.t)
+        self.wall_time += time.perf_counter() - began
+        if not self._ended():
+            self.outcome = Outcome(Ending.COMPLETED, self.state.t, "", f"completed at t = {self.state.t:g} s")
+        assert self.outcome is not None
+        return self.outcome
+
+    def _ended(self) -> bool:
+        return self.outcome is not None and self.outcome.ending is not Ending.COMPLETED
+
+    def _end(self, outcome: Outcome) -> None:
+        self.outcome = outcome
+        self._recording.log.append(LogEntry(outcome.t, "outcome", outcome.message))
+
+    def _next_stop(self) -> int:
+        """The step boundary at which something else than a step happens next."""
+        stops = [self.state.k + _CHUNK]
+        stops += [self._boundary(change) for change in self._pending[:1]]
+        stops += [(self.state.k // r.every + 1) * r.every for r in self._running.values()]
+        return min(stops)
+
+    def _boundary(self, change: Change) -> int:
+        return int(np.ceil(change.t / self.settings.h - 1e-6))
+
+    def _advance(self, n: int) -> None:
+        before = self.state
+        segment = self.kernel.advance(before, self.p, self.settings.rule, self.settings.h, n)
+        done = segment.x.shape[0]
+        t = (before.k + 1 + np.arange(done)) * self.settings.h
+        y = self.kernel.outputs(segment.x, segment.z, segment.d, before.u, self.p) if done else np.empty((0, len(self.model.y_names)))
+        lost = self._angles.first_beyond(segment.x, y, self.settings.delta_max_deg)
+        keep = done if lost is None else lost[0] + 1
+        self._recording.add(t[:keep], segment.x[:keep], segment.z[:keep], segment.d[:keep], before.u, y[:keep])
+        if segment.rescued:
+            text = f"{segment.rescued} steps up to t = {segment.state.t:g} s needed shorter inner steps or pivoting"
+            self._recording.log.append(LogEntry(segment.state.t, "solver", text))
+        self.state = segment.state
+        if lost is not None:
+            row, unit, angle = lost
+            self.state = State(before.k + row + 1, float(t[row]), segment.x[row], segment.z[row], segment.d[row], before.u)
+            text = f"{unit} lost synchronism at t = {t[row]:.4f} s: its rotor angle reached {angle:.1f} degrees"
+            self._end(Outcome(Ending.LOST_SYNCHRONISM, float(t[row]), unit, text))
+        elif segment.failed:
+            self._end(diagnose(self.kernel, self.state, self.p, self.settings.rule, self.settings.h, self._healthy))
+
+    # Events.
+
+    def _check_changes(self) -> None:
+        problems = []
+        for change in self._changes:
+            for path in (*change.values, *(change.increments or {})):
+                if path not in self.model.index["u"] and path not in self.model.index["p"]:
+                    near = _nearest(self.model, path)
+                    problems.append(Problem(path, f"no such parameter or set-point (event at t = {change.t:g} s)", hint=near))
+        if problems:
+            raise ConfigError(problems)
+
+    def _apply_due(self) -> None:
+        while self._pending and self._boundary(self._pending[0]) <= self.state.k and not self._ended():
+            self._apply(self._pending.pop(0))
+
+    def _apply(self, change: Change) -> None:
+        u, p = self.state.u.copy(), self.p.copy()
+        for values, add in ((change.values, False), (change.increments or {}, True)):
+            for path, value in values.items():
+                array, group = (u, "u") if path in self.model.index["u"] else (p, "p")
+                k = self.model.position(group, path)
+                array[k] = array[k] + value if add else value
+        moved = "" if abs(self.state.t - change.t) < 1e-9 else f" (asked for at t = {change.t:g} s)"
+        self._recording.log.append(LogEntry(self.state.t, "event", change.text + moved))
+        self._jump(u, p)
+
+    def _jump(self, u: Array, p: Array) -> None:
+        """New commands and parameters: the algebraic unknowns are solved again at fixed states."""
+        self.p = p
+        self.state = self.state.with_(u=u)
+        settled = self.kernel.settle(self.state, p)
+        if settled is None:
+            self._end(diagnose(self.kernel, self.state, p, self.settings.rule, self.settings.h, self._healthy))
+            return
+        self.state = settled
+        self._record_point()
+
+    def _record_point(self) -> None:
+        s = self.state
+        y = self.kernel.outputs(s.x, s.z, s.d, s.u, self.p)
+        self._recording.add(np.array([s.t]), s.x[None], s.z[None], s.d[None], s.u, y[None])
+
+    # Controllers.
+
+    def _start(self, name: str, controller: Controller) -> _Running:
+        every = round(controller.dt / self.settings.h)
+        if every < 1 or abs(every * self.settings.h - controller.dt) > 1e-9:
+            text = f"its sample time must be a whole multiple of the step {self.settings.h:g} s"
+            raise ConfigError([Problem(f"controller.{name}.dt", text, controller.dt)])
+        s = self.initial.state
+        y = self.kernel.outputs(s.x, s.z, s.d, s.u, self.initial.p)
+        missing = [path for path in controller.measures() if path not in self.model.index["y"]]
+        if missing:
+            raise ConfigError([Problem(f"controller.{name}", f"measures {path}, which does not exist", hint=_nearest(self.model, path)) for path in missing])
+        surroundings = Surroundings(
+            self.settings.h,
+            self.settings.rule,
+            dict(zip(self.model.u_names, s.u, strict=True)),
+            dict(zip(self.model.y_names, y, strict=True)),
+        )
+        plant = None
+        if controller.information == "perfect":
+            plant = Plant(self.model, Kernel(self.model, s, self.initial.p, self.settings.compile), self.initial.p.copy())
+        names = tuple(controller.measures())
+        columns = np.array([self.model.position("y", path) for path in names], dtype=int)
+        return _Running(controller, controller.start(surroundings, plant), every, columns, names)
+
+    def _control(self) -> None:
+        u = self.state.u.copy()
+        for name, running in self._running.items():
+            if self.state.k % running.every:
+                continue
+            s = self.state
+            y = self.kernel.outputs(s.x, s.z, s.d, s.u, self.p)
+            measured = dict(zip(running.names, y[running.measures], strict=True))
+            perfect = running.controller.information == "perfect"
+            sample = Sample(s.t, measured, s if perfect else None, self.p.copy() if perfect else None)
+            began = time.perf_counter()
+            action = running.session.act(sample)
+            running.solve_ms.append(1e3 * (time.perf_counter() - began))
+            running.t.append(s.t)
+            running.diagnostics.append(action.diagnostics)
+            running.cost += action.stage_cost
+            running.fallbacks += action.fallback
+            self._recording.log += [LogEntry(s.t, "controller", f"{name}: {note}") for note in action.notes]
+            for path, value in action.commands.items():
+                u[self.model.position("u", path)] = value
+        if not np.array_equal(u, self.state.u):
+            self._jump(u, self.p)
+
+    # What is left behind.
+
+    def trace(self) -> Trace:
+        """All samples so far."""
+        r, m = self._recording, self.model
+        t = np.concatenate(r.t)
+        columns: dict[str, Array] = {}
+        for names, blocks in ((m.y_names, r.y), (m.x_names, r.x), (m.d_names, r.d), (m.u_names, r.u)):
+            if names:
+                columns |= dict(zip(names, np.ascontiguousarray(np.concatenate(blocks).T), strict=True))
+        units = {path: m.units.get(path, "") for path in columns}
+        for name, running in self._running.items():
+            for key in {key: None for row in running.diagnostics for key in row}:
+                path = f"controller.{name}.{key}"
+                columns[path] = _held(t, running.t, [row.get(key, np.nan) for row in running.diagnostics])
+                units[path] = "ms" if key.endswith("_ms") else ""
+        return Trace(t, columns, units, tuple(sorted(r.log, key=lambda entry: entry.t)))
+
+    def result(self, title: str = "", config: Mapping[str, Any] | None = None) -> RunResult:
+        """The run so far as a record to be written."""
+        outcome = self.outcome or Outcome(Ending.COMPLETED, self.state.t, "", "not run to its end")
+        controllers = {
+            name: ControllerStatistics(len(r.t), tuple(r.solve_ms), r.fallbacks, r.cost) for name, r in self._running.items()
+        }
+        system = self.model.system
+        return RunResult(title, config or {}, system, outcome, self.trace(), self.state.k, self.wall_time, controllers)
+
+    # Snapshots.
+
+    def save(self, path: Path) -> None:
+        """Write the present point, parameters and the controllers' memories; ``resume`` goes on from it bit for bit."""
+        memory = {
+            f"controller:{name}:{key}": value for name, r in self._running.items() for key, value in r.session.memory().items()
+        }
+        memory["applied"] = np.array(len(self._changes) - len(self._pending))
+        self.state.save(path, self.model, self.p, memory)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a saved point; events before it are taken as past.
+
+        Raises:
+            SnapshotError: the file cannot be read or belongs to another model.
+        """
+        self.restart()
+        self.state, self.p, memory = State.load(path, self.model)
+        for name, running in self._running.items():
+            start = f"controller:{name}:"
+            own = {key[len(start) :]: value for key, value in memory.items() if key.startswith(start)}
+            if not own and running.session.memory():
+                raise SnapshotError(f"{path}: holds nothing of the controller {name!r}")
+            running.session.recall(own)
+        self._pending = self._changes[int(memory["applied"]) :]
+        self._recording = _Recording()
+        self._record_point()
+
+
+def _held(t: Array, instants: list[float], values: list[float]) -> Array:
+    """Samples of a quantity that is constant between instants, NaN before the first."""
+    position = np.searchsorted(np.array(instants), t + 1e-9, side="right") - 1
+    return np.where(position >= 0, np.array(values, dtype=float)[np.maximum(position, 0)], np.nan)
+
+
+def _nearest(model: Model, path: str) -> str:
+    from difflib import get_close_matches
+
+    near = get_close_matches(path, (*model.u_names, *model.p_names, *model.y_names), n=3)
+    return f"nearest: {', '.join(near)}" if near else ""
+
+
+class _Angles:
+    """Rotor angles against the infinite bus, or the centre of inertia where there is none."""
+
+    def __init__(self, model: Model) -> None:
+        machines = [d for d in model.system.devices if "machine" in d.components]
+        self.names = [d.path for d in machines]
+        self.columns = np.array([model.position("y", f"{d.path}.delta") for d in machines], dtype=int)
+        inertia = np.array([float(getattr(d.components["machine"], "H", 0.0)) * d.S_n for d in machines])
+        fixed = [d.path for d in model.system.devices if d.components and next(iter(d.components.values())).role == "source"]
+        self._theta = [model.position("x", f"{path}.theta") for path in fixed if f"{path}.theta" in model.index["x"]][:1]
+        self._fixed = bool(fixed) or bool(np.any(inertia == 0)) or not machines
+        self._weights = inertia / inertia.sum() if not self._fixed else None
+
+    def first_beyond(self, x: Array, y: Array, limit_deg: float) -> tuple[int, str, float] | None:
+        """First sample at which a machine is out of step: row, unit, angle in degrees."""
+        if not y.shape[0] or not self.columns.size:
+            return None
+        angles = y[:, self.columns]
+        if self._weights is not None:
+            angles = angles - (angles @ self._weights)[:, None]
+        elif self._theta:
+            angles = angles - x[:, self._theta]
+        beyond = np.abs(angles) > np.radians(limit_deg)
+        if not beyond.any():
+            return None
+        row = int(np.argmax(beyond.any(axis=1)))
+        unit = int(np.argmax(np.abs(angles[row])))
+        return row, self.names[unit], float(np.degrees(angles[row, unit]))
