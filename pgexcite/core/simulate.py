@@ -123,7 +123,7 @@ class Simulation:
             if path in index[group]:
                 return float(values[index[group][path]])
         state = self.state
-        y = self.kernel.outputs(state.x, state.z, state.d, state.u, self.p)
+        y = self.kernel.outputs(state, self.p)
         return float(y[self.model.position("y", path)])
 
     def set(self, path: str, value: float) -> None:
@@ -183,10 +183,9 @@ class Simulation:
         segment = self.kernel.advance(before, self.p, self.settings.rule, self.settings.h, n)
         done = segment.x.shape[0]
         t = (before.k + 1 + np.arange(done)) * self.settings.h
-        y = self.kernel.outputs(segment.x, segment.z, segment.d, before.u, self.p) if done else np.empty((0, len(self.model.y_names)))
-        lost = self._angles.first_beyond(segment.x, y, self.settings.delta_max_deg)
+        lost = self._angles.first_beyond(segment.x, segment.y, self.settings.delta_max_deg)
         keep = done if lost is None else lost[0] + 1
-        self._recording.add(t[:keep], segment.x[:keep], segment.z[:keep], segment.d[:keep], before.u, y[:keep])
+        self._recording.add(t[:keep], segment.x[:keep], segment.z[:keep], segment.d[:keep], before.u, segment.y[:keep])
         if segment.rescued:
             text = f"{segment.rescued} steps up to t = {segment.state.t:g} s needed shorter inner steps or pivoting"
             self._recording.log.append(LogEntry(segment.state.t, "solver", text))
@@ -239,7 +238,7 @@ class Simulation:
 
     def _record_point(self) -> None:
         s = self.state
-        y = self.kernel.outputs(s.x, s.z, s.d, s.u, self.p)
+        y = self.kernel.outputs(s, self.p)
         self._recording.add(np.array([s.t]), s.x[None], s.z[None], s.d[None], s.u, y[None])
 
     # Controllers.
@@ -250,7 +249,7 @@ class Simulation:
             text = f"its sample time must be a whole multiple of the step {self.settings.h:g} s"
             raise ConfigError([Problem(f"controller.{name}.dt", text, controller.dt)])
         s = self.initial.state
-        y = self.kernel.outputs(s.x, s.z, s.d, s.u, self.initial.p)
+        y = self.kernel.outputs(s, self.initial.p)
         missing = [path for path in controller.measures() if path not in self.model.index["y"]]
         if missing:
             raise ConfigError([Problem(f"controller.{name}", f"measures {path}, which does not exist", hint=_nearest(self.model, path)) for path in missing])
@@ -273,7 +272,7 @@ class Simulation:
             if self.state.k % running.every:
                 continue
             s = self.state
-            y = self.kernel.outputs(s.x, s.z, s.d, s.u, self.p)
+            y = self.kernel.outputs(s, self.p)
             measured = dict(zip(running.names, y[running.measures], strict=True))
             perfect = running.controller.information == "perfect"
             sample = Sample(s.t, measured, s if perfect else None, self.p.copy() if perfect else None)

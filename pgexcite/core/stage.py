@@ -11,6 +11,7 @@ A row with ``M = 0`` has ``b = 0``: it is imposed at the new point only. A state
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import casadi as ca
@@ -23,7 +24,7 @@ from pgexcite.core.model import Model, State
 Array = NDArray[np.float64]
 
 
-GAMMA = 2.0 - np.sqrt(2.0)
+GAMMA = 2.0 - math.sqrt(2.0)
 """TR-BDF2's intermediate point: both stages then share one coefficient, and the rule is L-stable."""
 ALPHA = 1.0 / (GAMMA * (2.0 - GAMMA))
 BETA = (1.0 - GAMMA) ** 2 / (GAMMA * (2.0 - GAMMA))

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
+from pgexcite.core.codegen import CompilationError, CompiledLoop, build, compiler, generate
 from pgexcite.core.model import Model, State
 from pgexcite.core.settings import Compile, Rule
 from pgexcite.core.stage import ALPHA, BETA, FROZEN, GAMMA, build_stage_functions
@@ -25,8 +26,14 @@ TOLERANCE = 1e-8
 MAX_ITERATIONS = 12
 STARTUP_STEPS = 2
 """Backward-Euler steps after a discontinuity when the rule is trapezoidal."""
+MOVED = 1e-6
+"""A discrete state that moves an algebraic unknown by more than this, pu, makes a discontinuity."""
+COMPILED_BY_DEFAULT = 400
+"""Entries of the factors up to which ``compile = "auto"`` waits for the compiler (about a second)."""
 MAX_SUBDIVISION = 256
 """Shortest inner step a failing step is retried with, as a fraction of the step."""
+
+_RULES: tuple[Rule, ...] = ("tr_bdf2", "trapezoidal", "backward_euler")
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,7 @@ class Segment:
     """Consecutive steps.
 
     Attributes:
-        x, z, d: samples after each step, shapes ``(done, n)``.
+        x, z, d, y: samples after each step, shapes ``(done, n)``.
         state: after the last step that was taken.
         failed: whether the step after ``state`` could not be taken at all.
         rescued: how many of the steps needed shorter inner steps or the pivoting solver.
@@ -43,6 +50,7 @@ class Segment:
     x: Array
     z: Array
     d: Array
+    y: Array
     state: State
     failed: bool = False
     rescued: int = 0
@@ -98,31 +106,76 @@ class Kernel:
         self._history = bind(functions.history, [self._x, self._z, *given, self._c], [self._b, self._mass])
         self._update = bind(functions.update, [self._x, self._z, *given, self._h], [self._d_next])
         self._outputs = bind(functions.outputs, [self._x, self._z, *given], [self._y])
+        self._compiled = self._compile(compile)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether steps run as C."""
+        return self._compiled is not None
+
+    def _compile(self, choice: Compile) -> CompiledLoop | None:
+        functions = self.functions
+        if choice == "never" or functions.newton is None or (choice == "auto" and compiler() is None):
+            return None
+        sizes = {"n_x": self._n_x, "n_z": self._z.size, "n_d": self._d.size, "n_y": self._y.size}
+        rule = {"gamma": repr(GAMMA), "alpha": repr(ALPHA), "beta": repr(BETA), "extrapolate": repr((1 - GAMMA) / GAMMA)}
+        limits = {"max_iterations": MAX_ITERATIONS, "tolerance2": repr(TOLERANCE * TOLERANCE), "startup_steps": STARTUP_STEPS}
+        thresholds = {"frozen": repr(FROZEN), "moved": repr(MOVED)}
+        source = generate(
+            [functions.newton, functions.history, functions.update, functions.outputs], sizes | rule | limits | thresholds
+        )
+        try:
+            library = build(source, only_cached=choice == "auto" and functions.entries > COMPILED_BY_DEFAULT)
+        except CompilationError:
+            if choice == "always":
+                raise
+            return None
+        return None if library is None else CompiledLoop(library)
 
     # The public faces: pure functions of frozen states.
 
     def advance(self, state: State, p: Array, rule: Rule, h: float, n: int) -> Segment:
         """Take up to ``n`` steps of length ``h`` (s); stops early only where a step cannot be taken at all."""
         self._load(state, p)
-        n_x = self._n_x
-        rows_x, rows_z, rows_d = np.empty((n, n_x)), np.empty((n, self._z.size)), np.empty((n, self._d.size))
-        done, startup, rescued, failed = 0, state.startup, 0, False
+        sizes = (self._n_x, self._z.size, self._d.size, self._y.size)
+        rows = [np.empty((n, size)) for size in sizes]
+        done, startup, rescued = 0, state.startup, 0
         while done < n:
-            took = self._step(rule, h, startup)
-            if not took:
-                rescued += 1
-                took = self._subdivide(rule, h)
-            if not took:
-                failed = True
+            count, startup = self._loop(rule, h, startup, [block[done:] for block in rows])
+            done += count
+            if done == n:
                 break
+            if not self._subdivide(rule, h):
+                break
+            rescued += 1
             startup = max(startup - 1, 0)
             if self._d.size and self._renew_discrete(h):
                 startup = STARTUP_STEPS
-            rows_x[done], rows_z[done], rows_d[done] = self._x, self._z, self._d
+            self._record(rows, done)
             done += 1
         k = state.k + done
         after = State(k, k * h, self._x, self._z, self._d, self._u, startup)
-        return Segment(rows_x[:done], rows_z[:done], rows_d[:done], after, failed, rescued)
+        x, z, d, y = (block[:done] for block in rows)
+        return Segment(x, z, d, y, after, done < n, rescued)
+
+    def _loop(self, rule: Rule, h: float, startup: int, rows: list[Array]) -> tuple[int, int]:
+        """Plain steps up to the end of ``rows`` or the first that fails; how many, and the startup steps left."""
+        n = rows[0].shape[0]
+        if self._compiled is not None:
+            given = [self._x, self._z, self._d, self._u, self._p]
+            return self._compiled.advance(_RULES.index(rule), h, n, startup, [*given, *rows])
+        for k in range(n):
+            if not self._step(rule, h, startup):
+                return k, startup
+            startup = max(startup - 1, 0)
+            if self._d.size and self._renew_discrete(h):
+                startup = STARTUP_STEPS
+            self._record(rows, k)
+        return n, startup
+
+    def _record(self, rows: list[Array], k: int) -> None:
+        self._outputs.trigger()
+        rows[0][k], rows[1][k], rows[2][k], rows[3][k] = self._x, self._z, self._d, self._y
 
     def settle(self, state: State, p: Array) -> State | None:
         """Solve the algebraic unknowns again at fixed states, after a discontinuity; ``None`` if no solution was found."""
@@ -131,17 +184,11 @@ class Kernel:
             return None
         return State(state.k, state.t, self._x, self._z, self._d, self._u, STARTUP_STEPS)
 
-    def outputs(self, x: Array, z: Array, d: Array, u: Array, p: Array) -> Array:
-        """Outputs ``y`` at one sample (1-D arguments) or at many (2-D ``x``, ``z``, ``d``, one row a sample; ``u``, ``p`` 1-D)."""
-        self._u[:], self._p[:] = u, p
-        rows_x, rows_z, rows_d = np.atleast_2d(x), np.atleast_2d(z), np.atleast_2d(d)
-        result = np.empty((rows_x.shape[0], self._y.size))
-        trigger = self._outputs.trigger
-        for k in range(rows_x.shape[0]):
-            self._x[:], self._z[:], self._d[:] = rows_x[k], rows_z[k], rows_d[k]
-            trigger()
-            result[k] = self._y
-        return result[0] if np.ndim(x) == 1 else result
+    def outputs(self, state: State, p: Array) -> Array:
+        """Outputs ``y`` at a state, shape ``(n_y,)``."""
+        self._x[:], self._z[:], self._d[:], self._u[:], self._p[:] = state.x, state.z, state.d, state.u, p
+        self._outputs.trigger()
+        return self._y.copy()
 
     # One step, on the work arrays.
 
@@ -252,7 +299,7 @@ class Kernel:
         if not self._resolve():
             self._x[:], self._z[:] = x, z
             return True
-        return bool(np.max(np.abs(self._z - z), initial=0.0) > 1e-6)
+        return bool(np.max(np.abs(self._z - z), initial=0.0) > MOVED)
 
 
 def step(kernel: Kernel, state: State, p: Array, h: float, rule: Rule = "tr_bdf2") -> State | None:
