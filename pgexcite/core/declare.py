@@ -85,7 +85,6 @@ def par(
         gt=gt,
         le=le,
         lt=lt,
-        allow_inf_nan=False,
         json_schema_extra={"unit": unit},
     )
 

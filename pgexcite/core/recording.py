@@ -137,8 +137,8 @@ def send_log(stream: Any, path: str, log: Sequence[LogEntry], t: Array, label: s
     stream.send_columns(path, [rr.TimeColumn("time", duration=at), rr.TimeColumn("step", sequence=steps)], columns)
 
 
-def plot(name: str, contents: Sequence[str]) -> Any:
-    """A time-series view with its legend out of the way and its time axis linked to that of every other view."""
+def plot(name: str, contents: Sequence[str], legend: str = "RightTop") -> Any:
+    """A time-series view, its time axis linked to that of every other; ``legend`` is the corner the curves leave free."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -146,15 +146,16 @@ def plot(name: str, contents: Sequence[str]) -> Any:
         contents=[*contents],
         name=name,
         axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.auto(legend)),
     )
 
 
 def text_log(name: str, contents: Sequence[str]) -> Any:
-    """A view of logs."""
+    """A view of logs; the text of an entry begins with its time."""
     import rerun.blueprint as rrb
 
-    return rrb.TextLogView(origin="/", contents=[*contents], name=name)
+    columns = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
+    return rrb.TextLogView(origin="/", contents=[*contents], name=name, columns=columns)
 
 
 def blueprint(*roots: Any) -> Any:

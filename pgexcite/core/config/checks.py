@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any, get_args
 
 from pydantic import BaseModel
@@ -21,6 +22,21 @@ EVENTS: dict[str, type[BaseModel]] = {
 
 _FROM_REGISTRY = {"backend": "mpc_backend", "estimator": "estimator"}
 """Fields of a controller that name another registered model, and the role it must have."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A system as far as it validated.
+
+    Attributes:
+        system: what validated.
+        names: all names the file declares, by kind of table, sound or not.
+        broken: paths of what did not validate; whatever refers into these has been complained of already.
+    """
+
+    system: System
+    names: Mapping[str, tuple[str, ...]]
+    broken: frozenset[str]
 
 
 def islands(buses: Iterable[str], branches: Iterable[Branch]) -> list[tuple[str, ...]]:
@@ -56,40 +72,43 @@ def check_islands(system: System, collect: Collector) -> None:
             )
 
 
-def check_reference(reference: str, system: System, collect: Collector) -> None:
+def check_reference(reference: str, grid: Grid, collect: Collector) -> None:
     """The angle reference is a word or a unit that exists."""
-    units = [device.name for device in system.devices if device.path.startswith("unit.")]
-    if collect.known("unit, nor such a reference", reference, ["auto", "infinite_bus", "centre_of_inertia", *units], "simulation.reference"):
-        sources = [device for device in system.devices if device.path.startswith("infinite_bus.")]
-        if reference == "infinite_bus" and not sources:
-            collect.add("simulation.reference", "there is no infinite bus here", reference, "use centre_of_inertia or a unit")
+    where, words = "simulation.reference", ("auto", "infinite_bus", "centre_of_inertia")
+    if not collect.known("reference or unit", reference, [*words, *grid.names["unit"]], where):
+        return
+    if reference == "infinite_bus" and not grid.names["infinite_bus"]:
+        collect.add(where, "there is no infinite bus here", reference, "use centre_of_inertia or a unit's name")
 
 
-def check_event(event: BaseModel, where: str, system: System, collect: Collector) -> None:
+def check_event(event: BaseModel, where: str, grid: Grid, collect: Collector) -> None:
     """What an event refers to exists."""
     if isinstance(event, Fault):
-        collect.known("bus", event.bus, system.buses, f"{where}.bus")
+        collect.known("bus", event.bus, grid.names["bus"], f"{where}.bus")
     elif isinstance(event, BranchTrip | BranchClose):
         kind = event.type.partition("_")[0]
-        collect.known(kind, event.name, system.lines if kind == "line" else system.transformers, f"{where}.name")
+        collect.known(kind, event.name, grid.names[kind], f"{where}.name")
     elif isinstance(event, LoadStep):
-        loads = [device.name for device in system.devices if device.path.startswith("load.")]
-        collect.known("load", event.load, loads, f"{where}.load")
-    elif isinstance(event, ParameterStep):
-        _check_parameter_step(event, where, system, collect)
+        collect.known("load", event.load, grid.names["load"], f"{where}.load")
+    elif isinstance(event, ParameterStep) and not any(event.path.startswith(f"{path}.") for path in grid.broken):
+        _check_parameter_step(event, where, grid.system, collect)
 
 
-def check_controller(controller: BaseModel, where: str, system: System, h: float | None, collect: Collector) -> None:
+def check_controller(controller: BaseModel, where: str, grid: Grid, h: float | None, collect: Collector) -> None:
     """A controller's sample time fits the step, and the unit and models it names exist."""
     dt = getattr(controller, "dt", None)
     if isinstance(dt, float) and h is not None:
         ratio = dt / h
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
             fitting = max(1, round(ratio)) * h
-            collect.add(f"{where}.dt", f"must be a whole multiple of the step simulation.h = {h:g} s", dt, f"{fitting:g} would do")
-    units = [device.name for device in system.devices if device.path.startswith("unit.")]
+            collect.add(
+                f"{where}.dt",
+                f"must be a whole multiple of the step simulation.h = {h:g} s",
+                dt,
+                f"{fitting:g} would do",
+            )
     if isinstance(unit := getattr(controller, "unit", None), str):
-        collect.known("unit", unit, units, f"{where}.unit")
+        collect.known("unit", unit, grid.names["unit"], f"{where}.unit")
     for field, role in _FROM_REGISTRY.items():
         if isinstance(name := getattr(controller, field, None), str):
             collect.find(role, name, f"{where}.{field}")

@@ -104,7 +104,9 @@ def _assign(data: dict[str, Any], parts: list[str], value: Any) -> Problem | Non
         last = depth == len(parts) - 1
         if isinstance(node, list):
             if not part.isdecimal() or int(part) >= len(node):
-                return Problem(where, f"there is no such entry; entries 0 to {len(node) - 1} exist", hint="count from zero")
+                return Problem(
+                    where, f"there is no such entry; entries 0 to {len(node) - 1} exist", hint="count from zero"
+                )
             if last:
                 node[int(part)] = value
             else:

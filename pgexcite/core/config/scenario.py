@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, radians
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from pgexcite.core.component import Component
 from pgexcite.core.config import checks, tables
+from pgexcite.core.config.devices import DeviceReader
 from pgexcite.core.config.files import override, read
-from pgexcite.core.config.validate import Collector
+from pgexcite.core.config.validate import Collector, plain
 from pgexcite.core.errors import ConfigError
 from pgexcite.core.events import Change
-from pgexcite.core.network import Bus, Line, NetworkElement, Shunt, Transformer
 from pgexcite.core.settings import Settings
-from pgexcite.core.system import Device, Schedule, System
-
-_NAME = re.compile(r"[\w-]+")
-_NETWORK: dict[str, type[NetworkElement]] = {"bus": Bus, "line": Line, "transformer": Transformer, "shunt": Shunt}
+from pgexcite.core.system import System
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,7 @@ def load(path: Path | str, overrides: Sequence[str] = ()) -> Scenario:
     Raises:
         ConfigError: with every problem of the file, each with its path.
     """
-    return from_data(override(read(path), overrides), Path(path))
+    return from_data(override(read(path), overrides), path)
 
 
 def from_data(data: Mapping[str, Any], path: Path | str = "") -> Scenario:
@@ -71,64 +65,102 @@ def from_data(data: Mapping[str, Any], path: Path | str = "") -> Scenario:
     Raises:
         ConfigError: with every problem, each with its path.
     """
-    reader = _Reader()
-    scenario = reader.scenario(data, Path(path))
-    if reader.collect.problems or scenario is None:
-        raise ConfigError(reader.collect.problems)
-    return scenario
+    collect = Collector()
+    document = _document(data, collect)
+    simulation = collect.validate(tables.SimulationTable, document.simulation, "simulation")
+    base = collect.validate(tables.SystemTable, document.system, "system")
+    record = collect.validate(tables.RecordTable, document.record, "record")
+    for sink in record.sinks if record else ():
+        collect.find("sink", sink, "record.sinks")
+    devices = DeviceReader(document, base.S_base if base else 1.0, collect)
+    system = System(
+        S_base=base.S_base if base else 1.0,
+        f_n=base.f_n if base else 1.0,
+        buses=devices.network["bus"],
+        lines=devices.network["line"],
+        transformers=devices.network["transformer"],
+        shunts=devices.network["shunt"],
+        devices=tuple(devices.devices),
+        reference=simulation.reference if simulation else "auto",
+    )
+    names = {kind: tuple(getattr(document, kind)) for kind in tables.NAMED_TABLES}
+    grid = checks.Grid(system, names, frozenset(devices.broken))
+    if not devices.broken:  # what is left out would make its neighbours look like an island
+        checks.check_islands(system, collect)
+    checks.check_reference(system.reference, grid, collect)
+    events = _events(document.event, grid, collect)
+    controllers = _controllers(document.controller, grid, simulation.h if simulation else None, collect)
+    if collect.problems or simulation is None or base is None or record is None:
+        raise ConfigError(collect.problems)
+    resolved = {
+        "title": document.title,
+        "expect": document.expect,
+        "simulation": plain(simulation),
+        "system": plain(base),
+        **devices.resolved,
+        "event": [plain(event) for event in events],
+        "controller": {
+            name: {"model": document.controller[name]["model"], **plain(item)} for name, item in controllers.items()
+        },
+        "record": plain(record),
+    }
+    return Scenario(
+        title=document.title,
+        expect=document.expect,
+        system=system,
+        settings=Settings(**simulation.model_dump(exclude={"reference"})),
+        changes=tuple(sorted((change for event in events for change in event.changes()), key=lambda change: change.t)),
+        controllers=controllers,
+        sinks=tuple(record.sinks),
+        resolved={key: value for key, value in resolved.items() if value != {} and value != []},
+        path=Path(path),
+    )
 
 
-class _Reader:
-    """Validates table after table and keeps what each resolved to. What did not validate is left out, its problems noted."""
+def _document(data: Mapping[str, Any], collect: Collector) -> tables.Document:
+    """The top level; what is malformed is noted and left out, so that the rest is validated all the same."""
+    try:
+        return tables.Document.model_validate(data)
+    except ValidationError as error:
+        collect.validate(tables.Document, data, "", also=["include"])
+        sound = {key: dict(value) if isinstance(value, dict) else value for key, value in data.items()}
+        for item in error.errors():
+            key, *below = item["loc"]
+            if below and isinstance(sound.get(str(key)), dict):
+                sound[str(key)].pop(below[0], None)
+            else:
+                sound.pop(str(key), None)
+        return tables.Document.model_validate(sound)
 
-    def __init__(self) -> None:
-        self.collect = Collector()
-        self.resolved: dict[str, Any] = {}
-        self.network: dict[str, dict[str, Any]] = {}
-        self.devices: list[Device] = []
 
-    def scenario(self, data: Mapping[str, Any], path: Path) -> Scenario | None:
-        document = self.collect.validate(tables.Document, data, "", also=["include"])
-        if document is None:
-            # What is well-formed is validated all the same: all problems of a file come at once.
-            document = tables.Document.model_construct(**_well_formed(data))
-        simulation = self._single(tables.SimulationTable, document.simulation, "simulation")
-        base = self._single(tables.SystemTable, document.system, "system")
-        record = self._single(tables.RecordTable, document.record, "record")
-        for sink in record.sinks if record else ():
-            self.collect.find("sink", sink, "record.sinks")
-        for kind, cls in _NETWORK.items():
-            self._network(kind, cls, getattr(document, kind))
-        S_base = base.S_base if base else 1.0
-        for kind, add in (("infinite_bus", self._source), ("unit", self._unit), ("load", self._load)):
-            self._each(kind, getattr(document, kind), lambda where, table, add=add: add(where, table, S_base))
-        system = System(
-            S_base=S_base,
-            f_n=base.f_n if base else 1.0,
-            buses=self.network["bus"],
-            lines=self.network["line"],
-            transformers=self.network["transformer"],
-            shunts=self.network["shunt"],
-            devices=tuple(self.devices),
-            reference=simulation.reference if simulation else "auto",
-        )
-        sound = not self.collect.problems
-        changes = self._events(document.event, system)
-        controllers = self._controllers(document.controller, system, simulation.h if simulation else None)
-        if sound:  # a table that did not validate would make these complain of what is only its consequence
-            checks.check_islands(system, self.collect)
-        if simulation is None or self.collect.problems:
-            if simulation is not None:
-                checks.check_reference(simulation.reference, system, self.collect)
-            return None
-        checks.check_reference(simulation.reference, system, self.collect)
-        settings = Settings(**simulation.model_dump(exclude={"reference"}))
-        resolved = {"title": document.title, "expect": document.expect, **self.resolved}
-        sinks = tuple(record.sinks) if record else ()
-        return Scenario(document.title, document.expect, system, settings, changes, controllers, sinks, resolved, path)
+def _events(entries: list[dict[str, Any]], grid: checks.Grid, collect: Collector) -> list[Any]:
+    events = []
+    for number, entry in enumerate(entries):
+        where = f"event.{number}"
+        if "type" not in entry:
+            collect.add(f"{where}.type", "is required", hint=f"one of {', '.join(checks.EVENTS)}")
+        elif collect.known("type of event", entry["type"], checks.EVENTS, f"{where}.type"):
+            event: Any = collect.validate(checks.EVENTS[entry["type"]], entry, where)
+            if event is not None:
+                collect.problems += event.problems(where)
+                checks.check_event(event, where, grid, collect)
+                events.append(event)
+    return events
 
-    def _single(self, cls: type[tables.Table], table: Any, name: str) -> Any:
-        found = self.collect.validate(cls, table, name)
-        if found is not None:
-            self.resolved[name] = _plain(found)
-        return found
+
+def _controllers(
+    declared: Mapping[str, dict[str, Any]], grid: checks.Grid, h: float | None, collect: Collector
+) -> dict[str, BaseModel]:
+    controllers = {}
+    for name, table in declared.items():
+        where = f"controller.{name}"
+        cls = collect.find("controller", table.get("model"), f"{where}.model")
+        if cls is None:
+            continue
+        settings = {key: value for key, value in table.items() if key != "model"}
+        # A controller's schema is its own: it may hold tuples and nested tables, which a strict reading of lists would refuse.
+        controller = collect.validate(cls, settings, where, also=["model"], strict=None)
+        if controller is not None:
+            checks.check_controller(controller, where, grid, h, collect)
+            controllers[name] = controller
+    return controllers

@@ -48,7 +48,9 @@ class InfiniteBusTable(Table):
     """An infinite bus; keys of its model stand beside these."""
 
     bus: str = Field(description="bus it is connected to")
-    V: float | None = Field(None, gt=0, description="voltage, pu; follows from a unit with P, Q and V where it is left out")
+    V: float | None = Field(
+        None, gt=0, description="voltage, pu; follows from a unit with P, Q and V where it is left out"
+    )
     angle_deg: float = Field(0.0, description="angle of its voltage, degrees")
     model: str = "infinite_bus"
 
@@ -88,9 +90,9 @@ class Document(Table):
 
     title: str = Field("", description="one line that says what the scenario shows")
     expect: Expectation = Field("completed", description="how the run ought to end")
-    simulation: dict[str, Any] = Field(description="how the run is integrated")
-    system: dict[str, Any] = Field(description="bases of the per-unit system")
-    bus: dict[str, dict[str, Any]] = Field(description="buses by name")
+    simulation: dict[str, Any] = Field({}, description="how the run is integrated")
+    system: dict[str, Any] = Field({}, description="bases of the per-unit system")
+    bus: dict[str, dict[str, Any]] = Field({}, description="buses by name")
     line: dict[str, dict[str, Any]] = Field({}, description="lines by name")
     transformer: dict[str, dict[str, Any]] = Field({}, description="transformers by name")
     shunt: dict[str, dict[str, Any]] = Field({}, description="shunts by name")
@@ -102,5 +104,6 @@ class Document(Table):
     record: dict[str, Any] = Field({}, description="what is written down")
 
 
+NAMED_TABLES = ("bus", "line", "transformer", "shunt", "infinite_bus", "unit", "load", "controller")
 TOP_LEVEL = (*Document.model_fields, "include")
 SINGLE_TABLES = ("simulation", "system", "record")

@@ -86,3 +86,8 @@ def _translate(error: Mapping[str, Any], cls: type[BaseModel], path: str, also: 
         return Problem(where, str(error["ctx"]["error"]), None if isinstance(value, dict) else value)
     message = str(error["msg"]).removeprefix("Input ")
     return Problem(where, message, value, f"it is the {meaning}{unit}" if meaning else "")
+
+
+def plain(record: BaseModel) -> dict[str, Any]:
+    """A record as data that TOML can hold, under the names the file uses; what is not set (``None``) is left out."""
+    return record.model_dump(mode="json", by_alias=True, exclude_none=True)
