@@ -61,7 +61,8 @@ class Capability:
             return np.empty((0, 2))
         p, q = self.rated
         radius = self.v_t * math.hypot(1.0 / self.X_d + q, p)
-        angle = np.linspace(0.0, math.pi / 2, 121)
+        steepest = math.acos(min(1.15 * self.v_t / radius, 1.0))  # beyond that only the stator limits
+        angle = np.linspace(math.pi / 2, steepest, 121)
         return np.column_stack([radius * np.cos(angle), radius * np.sin(angle) - self.v_t**2 / self.X_d])
 
     def under_excitation(self) -> Points:

@@ -43,7 +43,7 @@ class CapabilityView:
             rrb.Spatial2DView(
                 origin=entity(device.path, ROOT),
                 name=f"{device.name}: operating point P-Q on the capability curve [pu of the machine]",
-                visual_bounds=rrb.VisualBounds2D(x_range=[-45, 135], y_range=[-120, 120]),
+                visual_bounds=rrb.VisualBounds2D(x_range=[-30, 140], y_range=[-125, 125]),
                 background=rrb.Background(color=[16, 18, 20]),
             )
             for device in self.units
@@ -68,8 +68,9 @@ class CapabilityView:
             root = entity(device.path, ROOT)
             p, q = trace[f"{device.path}.p_e"], trace[f"{device.path}.q_e"]
             points = SCALE * np.column_stack([p, -q])
-            labels = [f"P {p[j]:.2f}  Q {q[j]:.2f}" for j in shown]
-            stream.send_columns(f"{root}/point", index, rr.Points2D.columns(positions=points[shown], labels=labels))
+            stream.send_columns(f"{root}/point", index, rr.Points2D.columns(positions=points[shown]))
+            text = [f"P {p[j]:.2f}   Q {q[j]:.2f}" for j in shown]
+            stream.send_columns(f"{root}/reading", index, rr.Points2D.columns(labels=text))
             jumps = np.flatnonzero(np.diff(trace.t) == 0) + 1
             way = [part for part in np.split(points, jumps) if len(part) > 1]
             faint = [*colour(k), 110]
@@ -102,18 +103,18 @@ class CapabilityView:
             stream.log(f"{root}/{name}", rr.LineStrips2D([drawn], colors=[rgb], radii=[0.7]), static=True)
             recording_labels(stream, f"{root}/{name}/name", [tuple(_label_place(name, drawn))], [label], rgb)
         p, q = curve.rated
+        recording_labels(stream, f"{root}/rated/name", [(SCALE * p + 16, -SCALE * q - 9)], ["rated"], (255, 255, 255))
         stream.log(
             f"{root}/rated",
-            rr.Points2D([(SCALE * p, -SCALE * q)], colors=[(255, 255, 255)], radii=[1.6], labels=["rated"]),
+            rr.Points2D([(SCALE * p, -SCALE * q)], colors=[(255, 255, 255)], radii=[1.6]),
             static=True,
         )
         for k, device in enumerate(self.units):
             if entity(device.path, ROOT) == root:
-                stream.log(
-                    f"{root}/point",
-                    rr.Points2D.from_fields(colors=[colour(k)], radii=[2.6], draw_order=40.0),
-                    static=True,
-                )
+                point = rr.Points2D.from_fields(colors=[colour(k)], radii=[2.6], draw_order=40.0)
+                stream.log(f"{root}/point", point, static=True)
+                reading = rr.Points2D.from_fields(positions=[(112, -112)], colors=[colour(k)], radii=[0.01], show_labels=True)
+                stream.log(f"{root}/reading", reading, static=True)
 
 
 def recording_labels(stream: Any, path: str, at: list[tuple[float, float]], text: list[str], rgb: recording.Colour) -> None:
@@ -126,6 +127,12 @@ def recording_labels(stream: Any, path: str, at: list[tuple[float, float]], text
 
 
 def _label_place(name: str, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
-    at = {"stator": 0.12, "field": 0.95, "under_excitation": 0.5, "turbine": 0.15}[name]
-    place: NDArray[np.float64] = drawn[min(int(at * len(drawn)), len(drawn) - 1)]
+    """Beside the curve, where no other passes."""
+    at, aside = {
+        "stator": (0.93, (20.0, -12.0)),
+        "field": (0.25, (0.0, 4.0)),
+        "under_excitation": (0.0, (34.0, -14.0)),
+        "turbine": (0.62, (-17.0, 0.0)),
+    }[name]
+    place: NDArray[np.float64] = drawn[int(at * (len(drawn) - 1))] + aside
     return place

@@ -23,16 +23,17 @@ DEGREES = "degrees"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A plot of the overview: its title, and the signals of every unit in it with their names."""
+    """A plot of the overview: its title, the signals of every unit in it with their names, and where its legend goes."""
 
     title: str
     signals: tuple[tuple[str, str], ...]
+    legend: str = "RightTop"
 
 
 QUANTITIES = (
     Quantity("Rotor angle δ [deg]", (("delta", "δ"),)),
     Quantity("Rotor speed ω [pu]", (("omega", "ω"),)),
-    Quantity("Terminal voltage V_t [pu]", (("v_t", "V_t"),)),
+    Quantity("Terminal voltage V_t [pu]", (("v_t", "V_t"),), "RightBottom"),
     Quantity("Field voltage E_fd and current i_fd [pu]", (("e_fd", "E_fd"), ("i_fd", "i_fd"))),
     Quantity("Active power P [pu of the machine]", (("p_e", "P"),)),
     Quantity("Reactive power Q [pu of the machine]", (("q_e", "Q"),)),
@@ -70,12 +71,11 @@ class Overview:
         import rerun.blueprint as rrb
 
         curves = [
-            recording.plot(quantity.title, [path for path, _, _ in series])
+            recording.plot(quantity.title, [path for path, _, _ in series], quantity.legend)
             for quantity, series in self._curves()
         ] + self._diagnostics()
-        left = rrb.Vertical(
-            self.single_line.view(), *self.capability.views(), row_shares=[2, *[3] * bool(self.capability.units)]
-        )
+        shares = [self.single_line.share(), *[1.0 for _ in self.capability.units[:1]]]
+        left = rrb.Vertical(self.single_line.view(), *self.capability.views(), row_shares=shares)
         log = recording.text_log("Events", [LOG])
         right = rrb.Vertical(rrb.Grid(*curves, grid_columns=2), log, row_shares=[5, 1])
         overview = rrb.Horizontal(left, right, column_shares=[2, 3], name="Overview")

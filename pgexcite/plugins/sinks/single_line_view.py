@@ -59,6 +59,11 @@ class SingleLineView:
         """Buses whose voltage is in the trace."""
         return tuple(bus for bus in self.diagram.buses if f"bus.{bus}.v" in self.signals)
 
+    def share(self) -> float:
+        """Height of the view for the width it has, against 1 for a square one."""
+        (left, right), (top, bottom) = self.diagram.bounds()
+        return float(np.clip((bottom - top) / (right - left), 0.45, 1.2))
+
     def view(self) -> Any:
         """The view of it."""
         import rerun.blueprint as rrb
@@ -104,7 +109,7 @@ class SingleLineView:
             rr.Points2D.from_fields(positions=ends, radii=[0.01] * len(ends), show_labels=True),
             static=True,
         )
-        middles = [drawing.branches[path].mean(axis=0) for path in self.branches]
+        middles = [drawing.branches[path].mean(axis=0) - (0.0, 33.0) for path in self.branches]
         stream.log(
             f"{ROOT}/flows",
             rr.Points2D.from_fields(positions=middles, colors=[_NOTE] * len(middles), radii=[0.01] * len(middles), show_labels=True),
@@ -134,10 +139,11 @@ class SingleLineView:
     def _flow(self, path: str, p: float, q: float) -> str:
         name = path.partition(".")[2]
         if p == 0.0 and q == 0.0:
-            return f"{name}: open"
+            return f"{name}  open"
         line = self.diagram.branches[path]
         forward = (line[1, 0] - line[0, 0]) * p >= 0
-        return f"{'' if forward else '← '}{abs(p) * self.system.S_base:.0f} MW, {q * self.system.S_base:.0f} Mvar{' →' if forward else ''}"
+        active = f"{abs(p) * self.system.S_base:.0f} MW"
+        return f"{name}  {active} →" if forward else f"← {active}  {name}"
 
 
 def _strips(lines: list[NDArray[np.float64]], rgb: Colour, radius: float) -> Any:
