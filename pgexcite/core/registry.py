@@ -108,9 +108,10 @@ def nearest(name: str, known: Iterable[str]) -> str:
     options = sorted(known)
     if not options:
         return "none is known here"
-    close = get_close_matches(name, options, n=1, cutoff=0.5)
+    folded = {option.casefold(): option for option in options}
+    close = get_close_matches(name.casefold(), folded, n=1, cutoff=0.5)
     listed = ", ".join(options[:20]) + (", ..." if len(options) > 20 else "")
-    return (f"did you mean {close[0]!r}? " if close else "") + f"known: {listed}"
+    return (f"did you mean {folded[close[0]]!r}? " if close else "") + f"known: {listed}"
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Checks across the tables of a scenario: names that refer to nothing, networks that hang in the air, sampling that does not fit."""
+"""Checks across the tables of a scenario: names of nothing, networks that hang in the air, sampling that does not fit."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def check_islands(system: System, collect: Collector) -> None:
         if len(free) != len(full):
             collect.add(
                 where,
-                f"{_listed(free)} leave V out and {_listed(full)} have all of P, Q and V; there must be as many of these as of those",
+                f"without V: {_listed(free)}; with all of P, Q and V: {_listed(full)}; there must be as many of these as of those",
                 hint="leave V out at one infinite bus for each unit that is given P, Q and V",
             )
 

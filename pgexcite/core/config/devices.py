@@ -66,7 +66,8 @@ class DeviceReader:
         if element is None:
             return {}
         self.network[kind][name] = element
-        return plain(element)
+        unsaid = {key for key in ("fault_status", "fault_R", "fault_X") if key not in element.model_fields_set}
+        return {key: value for key, value in plain(element).items() if key not in unsaid}
 
     def _source(self, kind: str, name: str, table: Mapping[str, Any]) -> dict[str, Any]:
         path = f"{kind}.{name}"
@@ -163,12 +164,12 @@ class DeviceReader:
                     )
             if said.V is None:
                 add(f"{path}.V", "is required of a slack: terminal voltage held, pu")
-            return Schedule(V=said.V, angle=radians(said.angle_deg), **limits)
+            return Schedule(V=said.V, angle=radians(said.angle_deg or 0.0), **limits)
         if said.P is None:
             add(f"{path}.P", "is required of a unit that is no slack: active power delivered, MW")
         if said.V is None and said.Q is None:
             add(f"{path}.V", "V (pu) or Q (Mvar) is required of a unit that is no slack")
-        if "angle_deg" in said.model_fields_set:
+        if said.angle_deg is not None:
             add(
                 f"{path}.angle_deg",
                 "only a slack's angle can be given",
@@ -178,7 +179,8 @@ class DeviceReader:
         return Schedule(P=said.P, Q=said.Q, V=said.V, **limits)
 
     def _check_bus(self, bus: object, path: str) -> None:
-        self._collect.known("bus", bus, self._buses, path)
+        if isinstance(bus, str):  # anything else is the schema's complaint
+            self._collect.known("bus", bus, self._buses, path)
 
 
 def _slots(table: Mapping[str, Any]) -> list[tuple[str, str, str | None]]:

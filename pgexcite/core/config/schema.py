@@ -72,7 +72,7 @@ def _loadable(role: str) -> Iterable[tuple[str, type[BaseModel]]]:
 
 def _model(cls: type[BaseModel], name: str, own: type[tables.Table] | None) -> dict[str, Any]:
     schema = cls.model_json_schema(ref_template="#/$defs/{model}")
-    table = own.model_json_schema() if own else {"properties": {}, "required": ["model"]}
+    table: dict[str, Any] = own.model_json_schema() if own else {"properties": {}, "required": ["model"]}
     schema["properties"] = table["properties"] | {"model": {"const": name}} | schema.get("properties", {})
     schema["required"] = [*table.get("required", []), *schema.get("required", [])]
     return schema

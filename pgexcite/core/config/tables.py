@@ -71,7 +71,9 @@ class UnitTable(Table):
     Q: float | None = Field(None, description="reactive power delivered, Mvar")
     V: float | None = Field(None, gt=0, description="terminal voltage held, pu")
     slack: bool = Field(False, description="holds voltage and angle; P and Q follow")
-    angle_deg: float = Field(0.0, description="angle of the terminal voltage of a slack, degrees")
+    angle_deg: float | None = Field(
+        None, description="angle of the terminal voltage of a slack, degrees; 0 where left out"
+    )
     Q_min: float | None = Field(None, description="lower reactive limit, Mvar; none where left out")
     Q_max: float | None = Field(None, description="upper reactive limit, Mvar; none where left out")
 
