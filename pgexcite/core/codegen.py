@@ -11,7 +11,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import casadi as ca
@@ -35,7 +35,8 @@ _DRIVER = r"""
 #define AT_LEAST_1(n) ((n) > 0 ? (n) : 1)
 
 typedef struct {{
-    double w[2][AT_LEAST_1(NW)], start[AT_LEAST_1(NW)], b[AT_LEAST_1(NX)], mass[AT_LEAST_1(NX)], d_next[AT_LEAST_1(ND)], c, norm;
+    double w[2][AT_LEAST_1(NW)], start[AT_LEAST_1(NW)], b[AT_LEAST_1(NX)];
+    double middle[AT_LEAST_1(NW)], b_middle[AT_LEAST_1(NX)], mass[AT_LEAST_1(NX)], d_next[AT_LEAST_1(ND)], c, norm;
     const double *d, *u, *p;
 }} Stage;
 
@@ -82,10 +83,22 @@ static int one_step(Stage *s, int rule, double h, int startup, double *x, double
     }}
     if (!solve(s)) return 0;
     if (rule == 0) {{
+        memcpy(s->middle, s->w[0], sizeof(double) * NW); memcpy(s->b_middle, s->b, sizeof(double) * NX);
         for (i = 0; i < NX; i++) s->b[i] = s->mass[i] * ({alpha} * s->w[0][i] - {beta} * x[i]);
         for (i = 0; i < NW; i++) s->w[0][i] += {extrapolate} * (s->w[0][i] - s->start[i]);
         if (!solve(s)) return 0;
     }}
+    memcpy(x, s->w[0], sizeof(double) * NX); memcpy(z, s->w[0] + NX, sizeof(double) * NZ);
+    return 1;
+}}
+
+/* Solves the algebraic unknowns again at fixed states. */
+static int settle(Stage *s, double *x, double *z) {{
+    int i;
+    s->c = {frozen};
+    for (i = 0; i < NX; i++) s->b[i] = s->mass[i] * x[i];
+    memcpy(s->w[0], x, sizeof(double) * NX); memcpy(s->w[0] + NX, z, sizeof(double) * NZ);
+    if (!solve(s)) return 0;
     memcpy(x, s->w[0], sizeof(double) * NX); memcpy(z, s->w[0] + NX, sizeof(double) * NZ);
     return 1;
 }}
@@ -100,16 +113,12 @@ static int renew(Stage *s, double h, double *x, double *z, double *d) {{
     for (i = 0; i < ND; i++) changed |= s->d_next[i] != d[i];
     if (!changed) return 0;
     memcpy(d, s->d_next, sizeof(double) * ND);
-    s->c = {frozen};
-    for (i = 0; i < NX; i++) s->b[i] = s->mass[i] * x[i];
-    memcpy(s->w[0], x, sizeof(double) * NX); memcpy(s->w[0] + NX, z, sizeof(double) * NZ);
-    if (!solve(s)) return 1;
+    memcpy(s->start, z, sizeof(double) * NZ);
+    if (!settle(s, x, z)) return 1;
     for (i = 0; i < NZ; i++) {{
-        double move = s->w[0][NX + i] - z[i];
-        if (move < 0) move = -move;
+        double move = z[i] > s->start[i] ? z[i] - s->start[i] : s->start[i] - z[i];
         if (move > moved) moved = move;
     }}
-    memcpy(x, s->w[0], sizeof(double) * NX); memcpy(z, s->w[0] + NX, sizeof(double) * NZ);
     return moved > {moved};
 }}
 
@@ -136,6 +145,100 @@ int pgexcite_advance(int rule, double h, int n, int *startup, double *x, double 
 """
 
 
+_ROLLOUT = r"""
+#define NU {n_u}
+#define NC {n_commands}
+#define NK {n_columns}
+#define NS {n_selected}
+
+static double S[NW * NK], S_next[NW * NK], S_b[AT_LEAST_1(NX) * NK], S_c[NC * NK];
+
+static void sense_history(Stage *s, const double *x, const double *z) {{
+    args[0] = x; args[1] = z; args[2] = s->d; args[3] = s->u; args[4] = s->p; args[5] = &s->c; args[6] = S; args[7] = S_c;
+    results[0] = S_b;
+    history_sensitivity(args, results, iwork, work, 0);
+}}
+
+static void sense_stage(Stage *s, const double *w, const double *b, double *to) {{
+    args[0] = w; args[1] = b; args[2] = &s->c; args[3] = s->d; args[4] = s->u; args[5] = s->p; args[6] = S_b; args[7] = S_c;
+    results[0] = to;
+    stage_sensitivity(args, results, iwork, work, 0);
+}}
+
+static void scale_by_mass(Stage *s, double alpha, const double *A, double beta, const double *B) {{
+    int i, k;
+    for (k = 0; k < NK; k++)
+        for (i = 0; i < NX; i++) S_b[k * NX + i] = s->mass[i] * (alpha * A[k * NW + i] - beta * B[k * NW + i]);
+}}
+
+static void sense_step(Stage *s, int rule, int euler) {{
+    if (rule == 2 || euler) {{
+        scale_by_mass(s, 1, S, 0, S);
+        sense_stage(s, s->w[0], s->b, S);
+    }} else {{
+        sense_history(s, s->start, s->start + NX);
+        if (rule == 1) {{
+            sense_stage(s, s->w[0], s->b, S);
+        }} else {{
+            sense_stage(s, s->middle, s->b_middle, S_next);
+            scale_by_mass(s, {alpha}, S_next, {beta}, S);
+            sense_stage(s, s->w[0], s->b, S);
+        }}
+    }}
+}}
+
+static void sense_settling(Stage *s, const double *x, const double *z) {{
+    memcpy(s->start, x, sizeof(double) * NX); memcpy(s->start + NX, z, sizeof(double) * NZ);
+    scale_by_mass(s, 1, S, 0, S);
+    sense_stage(s, s->start, s->b, S);
+}}
+
+/* Rolls out N samples of count[j] steps of length h[j] under moves[in_force[j]]; outputs and their derivatives after each. Returns
+   how many samples were completed. */
+int pgexcite_rollout(int rule, int N, const int *count, const double *h, const int *in_force, const int *commands, int startup,
+                     double *x, double *z, double *d, double *u, const double *p, const double *moves, int derivatives,
+                     double *y, double *dy) {{
+    static Stage s;
+    int j, i, k;
+    s.d = d; s.u = u; s.p = p; s.c = 0;
+    history_at(&s, x, z);
+    memset(S, 0, sizeof S); memset(S_c, 0, sizeof S_c);
+    for (j = 0; j < N; j++) {{
+        if (j == 0 || in_force[j] != in_force[j - 1]) {{
+            int moved = 0;
+            memset(S_c, 0, sizeof S_c);
+            for (i = 0; i < NC; i++) {{
+                double value = moves[in_force[j] * NC + i];
+                moved |= u[commands[i]] != value;
+                u[commands[i]] = value;
+                S_c[(in_force[j] * NC + i) * NC + i] = 1;
+            }}
+            s.c = {frozen};
+            if (moved) {{
+                if (!settle(&s, x, z)) return j;
+                startup = {startup_steps};
+            }} else for (i = 0; i < NX; i++) s.b[i] = s.mass[i] * x[i];
+            if (derivatives) sense_settling(&s, x, z);
+        }}
+        for (k = 0; k < count[j]; k++) {{
+            int euler = rule == 1 && startup > 0;
+            if (!one_step(&s, rule, h[j], startup, x, z)) return j;
+            if (derivatives) sense_step(&s, rule, euler);
+            if (startup > 0) startup--;
+            if (ND > 0 && renew(&s, h[j], x, z, d)) {{
+                startup = {startup_steps};
+                if (derivatives) sense_settling(&s, x, z);
+            }}
+        }}
+        args[0] = x; args[1] = z; args[2] = d; args[3] = u; args[4] = p; args[5] = S; args[6] = S_c;
+        results[0] = y + j * NS; results[1] = derivatives ? dy + (long)j * NS * NK : 0;
+        output_sensitivity(args, results, iwork, work, 0);
+    }}
+    return N;
+}}
+"""
+
+
 class CompilationError(PgexciteError):
     """C code was asked for and could not be had."""
 
@@ -157,8 +260,15 @@ def cache_directory() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "pgexcite"
 
 
-def generate(functions: Sequence[ca.Function], constants: dict[str, object]) -> str:
-    """C source of these functions and of the stepping loop around them."""
+def generate(functions: Sequence[ca.Function], constants: Mapping[str, object], *, rollout: bool = False) -> str:
+    """C source of these functions and of the stepping loop around them.
+
+    Args:
+        functions: ``newton``, ``history``, ``update``, ``outputs``; for a rollout also ``stage_sensitivity``,
+            ``history_sensitivity`` and ``output_sensitivity``.
+        constants: what the templates need.
+        rollout: whether to add the prediction loop.
+    """
     with tempfile.TemporaryDirectory() as folder:
         generator = ca.CodeGenerator("stage.c", {"with_header": False, "indent": 0})
         for function in functions:
@@ -168,7 +278,8 @@ def generate(functions: Sequence[ca.Function], constants: dict[str, object]) -> 
     if "#error" in source:
         raise CompilationError("part of the model cannot be expressed in C")
     sizes = {key: max(1, *(getattr(f, key)() for f in functions)) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}
-    return source + _DRIVER.format(**constants, **sizes)
+    template = _DRIVER + _ROLLOUT if rollout else _DRIVER
+    return source + template.format(**constants, **sizes)
 
 
 def build(source: str, *, only_cached: bool = False) -> Path | None:
@@ -204,19 +315,19 @@ def build(source: str, *, only_cached: bool = False) -> Path | None:
     return target
 
 
-class CompiledLoop:
-    """The stepping loop of a compiled library.
+def load(library: Path) -> ctypes.CDLL:
+    """Load a copy of a library of one's own: its work arrays are static, and two kernels of one model must not share them."""
+    with tempfile.TemporaryDirectory() as folder:
+        own = Path(folder) / library.name
+        shutil.copyfile(library, own)
+        return ctypes.CDLL(str(own))
 
-    The library keeps its work arrays in static memory, so each loop loads a copy of its own: two kernels of one model never share
-    them.
-    """
+
+class CompiledLoop:
+    """The stepping loop of a compiled library."""
 
     def __init__(self, library: Path) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            own = Path(folder) / library.name
-            shutil.copyfile(library, own)
-            self._library = ctypes.CDLL(str(own))
-        self._advance = self._library.pgexcite_advance
+        self._advance = load(library).pgexcite_advance
         self._advance.restype = ctypes.c_int
         pointer = ctypes.c_void_p
         self._advance.argtypes = [ctypes.c_int, ctypes.c_double, ctypes.c_int, pointer, *([pointer] * 9)]

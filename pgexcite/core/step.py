@@ -33,7 +33,7 @@ COMPILED_BY_DEFAULT = 400
 MAX_SUBDIVISION = 256
 """Shortest inner step a failing step is retried with, as a fraction of the step."""
 
-_RULES: tuple[Rule, ...] = ("tr_bdf2", "trapezoidal", "backward_euler")
+RULES: tuple[Rule, ...] = ("tr_bdf2", "trapezoidal", "backward_euler")
 
 
 @dataclass(frozen=True)
@@ -57,21 +57,21 @@ class Segment:
 
 
 @dataclass
-class _Bound:
+class Bound:
     """A compiled function bound to fixed arrays: a call costs about a microsecond instead of a hundred."""
 
     trigger: Callable[[], None]
     keep: list[Any] = field(default_factory=list)
 
 
-def bind(function: Any, arguments: list[Array], results: list[Array]) -> _Bound:
+def bind(function: Any, arguments: list[Array], results: list[Array]) -> Bound:
     """Bind a CasADi function to contiguous float64 arrays, which it reads and writes in place."""
     buffer, trigger = function.buffer()
     for k, array in enumerate(arguments):
         buffer.set_arg(k, memoryview(array))
     for k, array in enumerate(results):
         buffer.set_res(k, memoryview(array))
-    return _Bound(trigger, [function, buffer, *arguments, *results])
+    return Bound(trigger, [function, buffer, *arguments, *results])
 
 
 class Kernel:
@@ -81,6 +81,12 @@ class Kernel:
         model: the equations.
         state, p: operating point around which the fixed elimination order is chosen.
         compile: whether the loop runs as generated C; ``"auto"`` does so where a compiler is found.
+
+    Attributes:
+        x, z, d, u, p: the point the kernel is at, as work arrays (``begin`` loads them, ``take`` moves them on).
+        start, middle, w: solution before the last step, at TR-BDF2's intermediate point and after it, shape ``(n_x + n_z,)``.
+        b, b_middle, c: right-hand sides and coefficient of the last stages.
+        mass: coefficients of the derivatives at the present parameters, shape ``(n_x,)``.
     """
 
     def __init__(self, model: Model, state: State, p: Array, compile: Compile = "auto") -> None:
@@ -88,24 +94,25 @@ class Kernel:
         self.functions = build_stage_functions(model, state, p)
         n_x, n_z, n_d = len(model.x_names), len(model.z_names), len(model.d_names)
         self._n_x = n_x
-        self._w, self._w_next, self._w_start = (np.zeros(n_x + n_z) for _ in range(3))
-        self._b, self._mass, self._c, self._norm = np.zeros(n_x), np.zeros(n_x), np.zeros(1), np.zeros(1)
-        self._x, self._z = np.zeros(n_x), np.zeros(n_z)
-        self._d, self._d_next, self._h = np.zeros(n_d), np.zeros(n_d), np.zeros(1)
-        self._u, self._p = np.zeros(len(model.u_names)), np.zeros(p.size)
-        self._y = np.zeros(len(model.y_names))
-        given = [self._d, self._u, self._p]
-        stage = [self._b, self._c, *given]
+        self.w, self._w_next, self.start = (np.zeros(n_x + n_z) for _ in range(3))
+        self.b, self.mass, self.c, self._norm = np.zeros(n_x), np.zeros(n_x), np.zeros(1), np.zeros(1)
+        self.middle, self.b_middle = np.zeros(n_x + n_z), np.zeros(n_x)
+        self.x, self.z = np.zeros(n_x), np.zeros(n_z)
+        self.d, self._d_next, self._h = np.zeros(n_d), np.zeros(n_d), np.zeros(1)
+        self.u, self.p = np.zeros(len(model.u_names)), np.zeros(p.size)
+        self.y = np.zeros(len(model.y_names))
+        given = [self.d, self.u, self.p]
+        stage = [self.b, self.c, *given]
         functions = self.functions
-        self._newton: tuple[_Bound, _Bound] | None = None
+        self._newton: tuple[Bound, Bound] | None = None
         if functions.newton is not None:
             self._newton = (
-                bind(functions.newton, [self._w, *stage], [self._w_next, self._norm]),
-                bind(functions.newton, [self._w_next, *stage], [self._w, self._norm]),
+                bind(functions.newton, [self.w, *stage], [self._w_next, self._norm]),
+                bind(functions.newton, [self._w_next, *stage], [self.w, self._norm]),
             )
-        self._history = bind(functions.history, [self._x, self._z, *given, self._c], [self._b, self._mass])
-        self._update = bind(functions.update, [self._x, self._z, *given, self._h], [self._d_next])
-        self._outputs = bind(functions.outputs, [self._x, self._z, *given], [self._y])
+        self._history = bind(functions.history, [self.x, self.z, *given, self.c], [self.b, self.mass])
+        self._update = bind(functions.update, [self.x, self.z, *given, self._h], [self._d_next])
+        self._outputs = bind(functions.outputs, [self.x, self.z, *given], [self.y])
         self._compiled = self._compile(compile)
 
     @property
@@ -113,17 +120,18 @@ class Kernel:
         """Whether steps run as C."""
         return self._compiled is not None
 
+    def constants(self) -> dict[str, object]:
+        """What the C templates need to know of this kernel."""
+        sizes = {"n_x": self._n_x, "n_z": self.z.size, "n_d": self.d.size, "n_u": self.u.size, "n_y": self.y.size}
+        rule = {"gamma": repr(GAMMA), "alpha": repr(ALPHA), "beta": repr(BETA), "extrapolate": repr((1 - GAMMA) / GAMMA)}
+        limits = {"max_iterations": MAX_ITERATIONS, "tolerance2": repr(TOLERANCE * TOLERANCE), "startup_steps": STARTUP_STEPS}
+        return sizes | rule | limits | {"frozen": repr(FROZEN), "moved": repr(MOVED)}
+
     def _compile(self, choice: Compile) -> CompiledLoop | None:
         functions = self.functions
         if choice == "never" or functions.newton is None or (choice == "auto" and compiler() is None):
             return None
-        sizes = {"n_x": self._n_x, "n_z": self._z.size, "n_d": self._d.size, "n_y": self._y.size}
-        rule = {"gamma": repr(GAMMA), "alpha": repr(ALPHA), "beta": repr(BETA), "extrapolate": repr((1 - GAMMA) / GAMMA)}
-        limits = {"max_iterations": MAX_ITERATIONS, "tolerance2": repr(TOLERANCE * TOLERANCE), "startup_steps": STARTUP_STEPS}
-        thresholds = {"frozen": repr(FROZEN), "moved": repr(MOVED)}
-        source = generate(
-            [functions.newton, functions.history, functions.update, functions.outputs], sizes | rule | limits | thresholds
-        )
+        source = generate([functions.newton, functions.history, functions.update, functions.outputs], self.constants())
         try:
             library = build(source, only_cached=choice == "auto" and functions.entries > COMPILED_BY_DEFAULT)
         except CompilationError:
@@ -136,8 +144,8 @@ class Kernel:
 
     def advance(self, state: State, p: Array, rule: Rule, h: float, n: int) -> Segment:
         """Take up to ``n`` steps of length ``h`` (s); stops early only where a step cannot be taken at all."""
-        self._load(state, p)
-        sizes = (self._n_x, self._z.size, self._d.size, self._y.size)
+        self.begin(state, p)
+        sizes = (self._n_x, self.z.size, self.d.size, self.y.size)
         rows = [np.empty((n, size)) for size in sizes]
         done, startup, rescued = 0, state.startup, 0
         while done < n:
@@ -149,12 +157,12 @@ class Kernel:
                 break
             rescued += 1
             startup = max(startup - 1, 0)
-            if self._d.size and self._renew_discrete(h):
+            if self.d.size and self.renew_discrete(h):
                 startup = STARTUP_STEPS
             self._record(rows, done)
             done += 1
         k = state.k + done
-        after = State(k, k * h, self._x, self._z, self._d, self._u, startup)
+        after = State(k, k * h, self.x, self.z, self.d, self.u, startup)
         x, z, d, y = (block[:done] for block in rows)
         return Segment(x, z, d, y, after, done < n, rescued)
 
@@ -162,80 +170,82 @@ class Kernel:
         """Plain steps up to the end of ``rows`` or the first that fails; how many, and the startup steps left."""
         n = rows[0].shape[0]
         if self._compiled is not None:
-            given = [self._x, self._z, self._d, self._u, self._p]
-            return self._compiled.advance(_RULES.index(rule), h, n, startup, [*given, *rows])
+            given = [self.x, self.z, self.d, self.u, self.p]
+            return self._compiled.advance(RULES.index(rule), h, n, startup, [*given, *rows])
         for k in range(n):
-            if not self._step(rule, h, startup):
+            if not self.take(rule, h, startup):
                 return k, startup
             startup = max(startup - 1, 0)
-            if self._d.size and self._renew_discrete(h):
+            if self.d.size and self.renew_discrete(h):
                 startup = STARTUP_STEPS
             self._record(rows, k)
         return n, startup
 
     def _record(self, rows: list[Array], k: int) -> None:
         self._outputs.trigger()
-        rows[0][k], rows[1][k], rows[2][k], rows[3][k] = self._x, self._z, self._d, self._y
+        rows[0][k], rows[1][k], rows[2][k], rows[3][k] = self.x, self.z, self.d, self.y
 
     def settle(self, state: State, p: Array) -> State | None:
         """Solve the algebraic unknowns again at fixed states, after a discontinuity; ``None`` if no solution was found."""
-        self._load(state, p)
-        if not self._resolve():
+        self.begin(state, p)
+        if not self.settle_here():
             return None
-        return State(state.k, state.t, self._x, self._z, self._d, self._u, STARTUP_STEPS)
+        return State(state.k, state.t, self.x, self.z, self.d, self.u, STARTUP_STEPS)
 
     def outputs(self, state: State, p: Array) -> Array:
         """Outputs ``y`` at a state, shape ``(n_y,)``."""
-        self._x[:], self._z[:], self._d[:], self._u[:], self._p[:] = state.x, state.z, state.d, state.u, p
+        self.x[:], self.z[:], self.d[:], self.u[:], self.p[:] = state.x, state.z, state.d, state.u, p
         self._outputs.trigger()
-        return self._y.copy()
+        return self.y.copy()
 
-    # One step, on the work arrays.
+    # One step at a time, on the work arrays.
 
-    def _load(self, state: State, p: Array) -> None:
-        self._x[:], self._z[:], self._d[:], self._u[:], self._p[:] = state.x, state.z, state.d, state.u, p
-        self._c[0] = 0.0
+    def begin(self, state: State, p: Array) -> None:
+        """Go to a state."""
+        self.x[:], self.z[:], self.d[:], self.u[:], self.p[:] = state.x, state.z, state.d, state.u, p
+        self.c[0] = 0.0
         self._history.trigger()
 
-    def _step(self, rule: Rule, h: float, startup: int) -> bool:
-        n_x, w, start = self._n_x, self._w, self._w_start
-        start[:n_x], start[n_x:] = self._x, self._z
+    def take(self, rule: Rule, h: float, startup: int) -> bool:
+        """Move ``x`` and ``z`` one step on; ``False``, and nothing moved, where the stages do not converge."""
+        n_x, w, start = self._n_x, self.w, self.start
+        start[:n_x], start[n_x:] = self.x, self.z
         w[:] = start
         if rule == "backward_euler" or (rule == "trapezoidal" and startup > 0):
-            self._c[0] = h
-            np.multiply(self._mass, self._x, out=self._b)
+            self.c[0] = h
+            np.multiply(self.mass, self.x, out=self.b)
         else:
-            self._c[0] = h / 2 if rule == "trapezoidal" else GAMMA * h / 2
+            self.c[0] = h / 2 if rule == "trapezoidal" else GAMMA * h / 2
             self._history.trigger()
         if not self._solve():
             return False
         if rule == "tr_bdf2":
-            middle = self._w[:n_x].copy()
-            self._b[:] = self._mass * (ALPHA * middle - BETA * self._x)
+            self.middle[:], self.b_middle[:] = w, self.b
+            self.b[:] = self.mass * (ALPHA * w[:n_x] - BETA * self.x)
             w += ((1 - GAMMA) / GAMMA) * (w - start)
             if not self._solve():
                 return False
-        self._x[:], self._z[:] = w[:n_x], w[n_x:]
+        self.x[:], self.z[:] = w[:n_x], w[n_x:]
         return True
 
     def _solve(self) -> bool:
         """Newton on the stage from ``_w``, in place."""
         if self._newton is not None:
-            start = self._w.copy()
+            start = self.w.copy()
             for iteration in range(MAX_ITERATIONS):
                 self._newton[iteration & 1].trigger()
                 if self._norm[0] < TOLERANCE * TOLERANCE:
                     if not iteration & 1:
-                        self._w[:] = self._w_next
-                    return bool(np.isfinite(self._w.sum()))
+                        self.w[:] = self._w_next
+                    return bool(np.isfinite(self.w.sum()))
                 if not self._norm[0] < 1e20:
                     break
-            self._w[:] = start
+            self.w[:] = start
         return self._solve_pivoting()
 
     def _solve_pivoting(self) -> bool:
         """Damped Newton on the stage with a pivoting sparse LU, where the fixed order fails or does not exist."""
-        w = self._w.copy()
+        w = self.w.copy()
         r, jacobian = self._residual(w)
         error = float(np.linalg.norm(r))
         for _ in range(4 * MAX_ITERATIONS):
@@ -258,48 +268,49 @@ class Kernel:
                 return False
             w, r, jacobian, error = trial, r_trial, jacobian_trial, error_trial
             if converged:
-                self._w[:] = w
+                self.w[:] = w
                 return True
         return False
 
     def _residual(self, w: Array) -> tuple[Array, sp.csc_matrix]:
-        r, jacobian = self.functions.residual(w, self._b, self._c, self._d, self._u, self._p)
+        r, jacobian = self.functions.residual(w, self.b, self.c, self.d, self.u, self.p)
         return np.array(r).ravel(), jacobian.sparse()
 
     def _subdivide(self, rule: Rule, h: float) -> bool:
         """The same step in shorter inner steps."""
-        x, z = self._x.copy(), self._z.copy()
+        x, z = self.x.copy(), self.z.copy()
         parts = 2
         inner: Rule = "backward_euler" if rule == "trapezoidal" else rule
         while parts <= MAX_SUBDIVISION:
-            if all(self._step(inner, h / parts, 0) for _ in range(parts)):
+            if all(self.take(inner, h / parts, 0) for _ in range(parts)):
                 return True
-            self._x[:], self._z[:] = x, z
+            self.x[:], self.z[:] = x, z
             parts *= 4
         return False
 
-    def _resolve(self) -> bool:
-        self._c[0] = FROZEN
-        np.multiply(self._mass, self._x, out=self._b)
+    def settle_here(self) -> bool:
+        """Solve ``z`` again at fixed ``x``."""
+        self.c[0] = FROZEN
+        np.multiply(self.mass, self.x, out=self.b)
         n_x = self._n_x
-        self._w[:n_x], self._w[n_x:] = self._x, self._z
+        self.w[:n_x], self.w[n_x:] = self.x, self.z
         if not self._solve():
             return False
-        self._x[:], self._z[:] = self._w[:n_x], self._w[n_x:]
+        self.x[:], self.z[:] = self.w[:n_x], self.w[n_x:]
         return True
 
-    def _renew_discrete(self, h: float) -> bool:
+    def renew_discrete(self, h: float) -> bool:
         """Renew the discrete states; True where that moved the algebraic equations, which are then solved again."""
         self._h[0] = h
         self._update.trigger()
-        if np.array_equal(self._d_next, self._d):
+        if np.array_equal(self._d_next, self.d):
             return False
-        self._d[:] = self._d_next
-        x, z = self._x.copy(), self._z.copy()
-        if not self._resolve():
-            self._x[:], self._z[:] = x, z
+        self.d[:] = self._d_next
+        x, z = self.x.copy(), self.z.copy()
+        if not self.settle_here():
+            self.x[:], self.z[:] = x, z
             return True
-        return bool(np.max(np.abs(self._z - z), initial=0.0) > MOVED)
+        return bool(np.max(np.abs(self.z - z), initial=0.0) > MOVED)
 
 
 def step(kernel: Kernel, state: State, p: Array, h: float, rule: Rule = "tr_bdf2") -> State | None:
