@@ -7,7 +7,7 @@ it is asked for.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -84,17 +84,23 @@ def find(role: str, name: str) -> type[Any]:
     return _load(role, found[0])
 
 
+def registrations(role: str) -> Iterator[Registration]:
+    """All registrations of a role, by name; nothing is imported."""
+    for name, found in sorted(_entries(role).items()):
+        for item in found:
+            yield Registration(role, name, item.value, _owner(item))
+
+
 def health() -> Iterator[Registration]:
     """Load every registered model and say which cannot be used, and why; one that is broken does not stop the others."""
     for role in GROUPS:
-        for name, found in sorted(_entries(role).items()):
-            error = ""
+        for item in registrations(role):
             try:
-                find(role, name)
+                find(role, item.name)
             except RegistryError as problem:
-                error = str(problem)
-            for item in found:
-                yield Registration(role, name, item.value, _owner(item), error)
+                yield replace(item, error=str(problem))
+            else:
+                yield item
 
 
 def refresh() -> None:

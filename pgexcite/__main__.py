@@ -1,0 +1,5 @@
+"""``python -m pgexcite``."""
+
+from pgexcite.cli import main
+
+main()

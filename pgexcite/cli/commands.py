@@ -1,0 +1,228 @@
+"""The commands. What is heavy is imported inside them, so that ``--help`` answers at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pgexcite.cli import show
+from pgexcite.core.errors import AssemblyError, ConfigError, InitialisationError, PgexciteError, RegistryError
+
+EXIT_CONFIG = 3
+EXIT_INITIALISATION = 4
+EXIT_OUTCOME = 5
+_EXIT: tuple[tuple[type[PgexciteError], int], ...] = (
+    (InitialisationError, EXIT_INITIALISATION),
+    (ConfigError, EXIT_CONFIG),
+    (RegistryError, EXIT_CONFIG),
+    (AssemblyError, EXIT_CONFIG),
+)
+
+
+class _Commands(click.Group):
+    """Turns the project's errors into a message and an exit code; a traceback is left to bugs."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except PgexciteError as error:
+            click.echo(f"error: {error}", err=True)
+            ctx.exit(next((code for kind, code in _EXIT if isinstance(error, kind)), 1))
+
+
+_config = click.argument("config", type=click.Path(path_type=Path, dir_okay=False))
+_set = click.option(
+    "--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Override a value of the scenario; may be repeated."
+)
+_json = click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
+
+
+@click.group(
+    cls=_Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Exit codes: 0 as expected, 1 other failure, 2 usage, 3 configuration, 4 initialisation, "
+    "5 a run that ended otherwise than its scenario expects.",
+)
+@click.version_option(package_name="pgexcite")
+def main() -> None:
+    """Judge and run field-excitation controllers of synchronous generators on a realistic grid."""
+
+
+@main.command()
+@_config
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Directory of the record [runs/CONFIG].")
+@_set
+@click.option("--live", is_flag=True, help="Serve the run to a viewer while it goes on.")
+@click.option("--resume", type=click.Path(path_type=Path, dir_okay=False), help="Go on from a snapshot.")
+@click.option("--snapshot-at", type=float, metavar="T", help="Keep a snapshot of time T (s) in the record.")
+@_json
+def run(
+    config: Path,
+    out: Path | None,
+    overrides: tuple[str, ...],
+    live: bool,
+    resume: Path | None,
+    snapshot_at: float | None,
+    as_json: bool,
+) -> None:
+    """Simulate a scenario and write the record of the run."""
+    from pgexcite.cli.running import execute
+    from pgexcite.core.config import load
+    from pgexcite.core.record import ensure_replaceable
+    from pgexcite.core.summary import summarise
+
+    scenario = load(config, overrides)
+    directory = out or Path("runs") / config.stem
+    ensure_replaceable(directory)
+    result = execute(scenario, directory, live=live, resume=resume, snapshot_at=snapshot_at)
+    summary = summarise(result)
+    if as_json:
+        show.json({"directory": str(directory), **summary})
+    else:
+        show.summary(scenario.title or config.stem, result.outcome.message, summary, directory)
+    ending = result.outcome.ending.value
+    if ending != scenario.expect:
+        click.echo(f"error: the run ended as {ending}, the scenario expects {scenario.expect}", err=True)
+        click.get_current_context().exit(EXIT_OUTCOME)
+
+
+@main.command()
+@_config
+@_set
+@_json
+def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Validate a scenario and solve its initial operating point."""
+    from pgexcite.core.config import load
+    from pgexcite.core.initialise import initialise
+
+    scenario = load(config, overrides)
+    point = show.operating_point(initialise(scenario.system))
+    if as_json:
+        show.json(point)
+    else:
+        click.echo(f"{config} is valid; steady state with a residual of {point['residual']:.1e}")
+        show.table(point["buses"])
+        show.table(point["devices"])
+
+
+@main.command(name="list")
+@click.option("--role", help="Only this family of models.")
+@_json
+def list_models(role: str | None, as_json: bool) -> None:
+    """List every registered model, the broken ones with the cause."""
+    from dataclasses import asdict
+
+    from pgexcite.core import registry
+
+    if role is not None:
+        registry.names(role)
+    found = [asdict(item) for item in registry.health() if role in (None, item.role)]
+    if as_json:
+        show.json(found)
+    else:
+        show.table([{**item, "error": item["error"] or "ok"} for item in found], rename={"error": "state"})
+
+
+@main.command()
+@click.argument("model")
+@_json
+def describe(model: str, as_json: bool) -> None:
+    """Describe a model: its parameters, units, ports and source. MODEL is a name, or role.name."""
+    from pgexcite.cli.describing import describe_model
+
+    for description in describe_model(model):
+        if as_json:
+            show.json(description)
+        else:
+            show.description(description)
+
+
+@main.command()
+@_config
+@_set
+@_json
+def eig(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Modes at the initial operating point: eigenvalues, damping, participation; controllers are left out."""
+    from pgexcite.core.config import load
+    from pgexcite.core.initialise import initialise
+    from pgexcite.core.linearise import linearise
+
+    initial = initialise(load(config, overrides).system)
+    modes = [mode.as_dict() for mode in linearise(initial.model, initial.state, initial.p).modes()]
+    if as_json:
+        show.json({"modes": modes})
+    else:
+        show.modes(modes)
+
+
+@main.command()
+@_config
+@_set
+@click.option(
+    "--tolerance", type=click.FloatRange(min=1e-6), default=1e-4, show_default=True, help="Width of the bracket, s."
+)
+@_json
+def cct(config: Path, overrides: tuple[str, ...], tolerance: float, as_json: bool) -> None:
+    """Critical clearing time of the scenario's fault, by bisection."""
+    from dataclasses import asdict
+
+    from pgexcite.core.config import load
+    from pgexcite.studies.cct import critical_clearing_time
+
+    found = critical_clearing_time(load(config, overrides), tolerance)
+    if as_json:
+        show.json(asdict(found))
+    else:
+        click.echo(
+            f"critical clearing time   {found.t_crit:.5f} s (stable at {found.bracket[0]:.5f}, not at {found.bracket[1]:.5f})"
+        )
+        click.echo(f"rotor angle at clearing  {found.delta_crit_deg:.2f} deg, {found.unit}")
+        click.echo(f"beyond it                {found.outcome}; {found.runs} runs")
+
+
+@main.command(name="equal-area")
+@_config
+@_set
+@click.option("--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw the construction into this file.")
+@_json
+def equal_area(config: Path, overrides: tuple[str, ...], figure: Path | None, as_json: bool) -> None:
+    """Equal-area construction of the scenario's fault, for one machine against an infinite bus."""
+    from pgexcite.core.config import load
+    from pgexcite.studies.equal_area import equal_area as construct
+
+    found = construct(load(config, overrides))
+    if figure is not None:
+        found.figure(figure)
+    if as_json:
+        show.json(found.as_dict())
+    else:
+        show.table(found.rows())
+
+
+@main.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path, file_okay=False))
+@click.option(
+    "--out", type=click.Path(path_type=Path, file_okay=False), help="Where picture and recording go [runs/compare]."
+)
+@_json
+def compare(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
+    """Overlay several runs in one recording and one picture, with a table of their figures."""
+    from pgexcite.studies.compare import compare as overlay
+
+    found = overlay(list(runs), out or Path("runs") / "compare")
+    if as_json:
+        show.json({"rows": found.rows, "picture": str(found.picture), "recording": str(found.recording)})
+    else:
+        show.table(found.rows)
+        click.echo(f"picture:   {found.picture}")
+        click.echo(f"recording: {found.recording}   (open it with: rerun {found.recording})")
+
+
+@main.command()
+def schema() -> None:
+    """Print the JSON Schema of scenario files, for editors."""
+    from pgexcite.core.config import json_schema
+
+    show.json(json_schema())
