@@ -50,10 +50,15 @@ def colour(index: int) -> Colour:
 
 
 def entity(path: str, *prefix: str) -> str:
-    """Entity path of a signal: ``unit.G2.v_t`` becomes ``/unit/G2/v_t``, names escaped as rerun wants them."""
+    """Entity path of a signal: ``unit.G2.v_t`` becomes ``/unit/G2/v_t``, below ``prefix``."""
+    return entity_of(*prefix, *path.split("."))
+
+
+def entity_of(*names: str) -> str:
+    """Entity path of names, escaped as rerun wants them."""
     import rerun as rr
 
-    return str(rr.new_entity_path([*prefix, *path.split(".")]))
+    return str(rr.new_entity_path([*names]))
 
 
 def application_id(title: str, structure: Iterable[str]) -> str:

@@ -1,0 +1,159 @@
+"""Several finished runs side by side: a table, a picture and one recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pgexcite.core import recording
+from pgexcite.core.errors import PgexciteError
+from pgexcite.core.record import Record, read_record
+from pgexcite.core.recording import Colour, colour, entity
+from pgexcite.core.summary import unit_names
+from pgexcite.core.trace import Trace
+from pgexcite.studies.figures import PANELS, draw_runs
+from pgexcite.studies.measures import first_swing_max, recovery_time, swing_damping
+
+PICTURE_FILE = "compare.png"
+RECORDING_FILE = "compare.rrd"
+
+
+class CompareError(PgexciteError):
+    """These runs cannot be compared."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A finished comparison.
+
+    Attributes:
+        rows: one per run and unit: ``label``, ``unit``, ``outcome``, the unit's figures of ``summary.json``, and ``first_swing_deg``,
+            ``recovery_5`` and ``recovery_1`` [s after the last event], ``damping`` (of the swing), ``controllers``.
+        picture: the PNG.
+        recording: the ``.rrd``.
+    """
+
+    rows: list[dict[str, Any]]
+    picture: Path
+    recording: Path
+
+
+def compare(run_dirs: Sequence[Path | str], out_dir: Path | str, labels: Sequence[str] | None = None) -> Comparison:
+    """Overlay runs.
+
+    Args:
+        run_dirs: directories of records; a run is labelled with its directory's name.
+        out_dir: where the picture and the recording go; other files in it are left alone.
+        labels: labels to use instead, one per run.
+
+    Raises:
+        CompareError: fewer than one run, labels that do not fit, or no unit in common.
+        RecordError: a directory is not the record of a run.
+    """
+    records = [read_record(Path(directory).resolve()) for directory in run_dirs]
+    named = dict(zip(_labels(records, labels), records, strict=True))
+    runs = {label: record.trace for label, record in named.items()}
+    units = _common_units(runs)
+    out = Path(out_dir)
+    out.mkdir(parents=True, exist_ok=True)
+    title = _title(records)
+    return Comparison(
+        rows=[_row(label, record, unit) for label, record in named.items() for unit in units],
+        picture=draw_runs(runs, units, out / PICTURE_FILE, title),
+        recording=overlay(runs, units, out / RECORDING_FILE, title),
+    )
+
+
+def overlay(runs: Mapping[str, Trace], units: Sequence[str], path: Path, title: str) -> Path:
+    """One recording of several runs: a colour per run, a column per unit, all signals under ``/runs/<label>``."""
+    import rerun.blueprint as rrb
+
+    curves: dict[tuple[str, str], list[tuple[str, str, Colour]]] = {}
+    for k, (label, trace) in enumerate(runs.items()):
+        for unit in units:
+            for signal, symbol, _ in PANELS:
+                if f"unit.{unit}.{signal}" in trace.columns:
+                    where = _entity(label, unit, signal)
+                    curves.setdefault((unit, signal), []).append((where, f"{label} {symbol}", colour(k)))
+    stream = recording.new_stream(title, [*runs, *(f"{unit}.{signal}" for unit, signal in curves)])
+    titles = {"e_fd": "field voltage E_fd [pu]", "v_t": "terminal voltage V_t [pu]", "delta": "rotor angle δ [deg]", "omega": "rotor speed ω [pu]"}
+    columns = [
+        rrb.Vertical(
+            *(
+                recording.plot(f"{unit}: {titles[signal]}", [where for where, _, _ in curves[unit, signal]])
+                for signal, _, _ in PANELS
+                if (unit, signal) in curves
+            ),
+            name=unit,
+        )
+        for unit in units
+    ]
+    log = recording.text_log("Events of all runs", ["/log/**"])
+    body = columns[0] if len(columns) == 1 else (rrb.Horizontal(*columns) if len(columns) <= 3 else rrb.Tabs(*columns))
+    recording.save(stream, path, recording.blueprint(rrb.Vertical(body, log, row_shares=[5, 1])))
+    for series in curves.values():
+        for where, name, rgb in series:
+            recording.style(stream, where, name, rgb)
+    for label, trace in runs.items():
+        samples = {entity(signal, "runs", label): values for signal, values in trace.columns.items()}
+        for unit in units:
+            if f"unit.{unit}.delta" in trace.columns:
+                samples[_entity(label, unit, "delta")] = np.degrees(trace[f"unit.{unit}.delta"])
+        recording.send_scalars(stream, samples, trace.t)
+        recording.send_log(stream, recording.entity_of("log", label), trace.log, trace.t, label=f"{label}: ")
+    recording.finish(stream)
+    return path
+
+
+def _entity(label: str, unit: str, signal: str) -> str:
+    prefix = ("degrees", label) if signal == "delta" else ("runs", label)
+    return entity(f"unit.{unit}.{signal}", *prefix)
+
+
+def _labels(records: Sequence[Record], labels: Sequence[str] | None) -> list[str]:
+    if not records:
+        raise CompareError("no run was given; name the directories of one or more runs")
+    if labels is not None:
+        if len(labels) != len(records) or len(set(labels)) != len(labels):
+            raise CompareError(f"{len(records)} runs need as many different labels; got {list(labels)}")
+        return list(labels)
+    found: list[str] = []
+    for record in records:
+        name, number = record.directory.name, 2
+        while name in found:
+            name, number = f"{record.directory.name} ({number})", number + 1
+        found.append(name)
+    return found
+
+
+def _common_units(runs: Mapping[str, Trace]) -> list[str]:
+    first, *others = [unit_names(trace) for trace in runs.values()]
+    units = [unit for unit in first if all(unit in names for names in others)]
+    if not units:
+        raise CompareError(f"the runs have no unit in common; theirs are {', '.join(str(unit_names(t)) for t in runs.values())}")
+    return units
+
+
+def _title(records: Sequence[Record]) -> str:
+    titles = list(dict.fromkeys(record.title for record in records if record.title))
+    return titles[0] if len(titles) == 1 else f"{len(records)} runs compared"
+
+
+def _row(label: str, record: Record, unit: str) -> dict[str, Any]:
+    has = record.trace.signals(f"unit.{unit}")
+    return {
+        "label": label,
+        "unit": unit,
+        "outcome": record.summary["outcome"],
+        "t_end": record.summary["t_end"],
+        **record.summary["units"][unit],
+        "first_swing_deg": first_swing_max(record.trace, unit) if "delta" in has else None,
+        "recovery_5": recovery_time(record.trace, unit, 0.05) if "v_t" in has else None,
+        "recovery_1": recovery_time(record.trace, unit, 0.01) if "v_t" in has else None,
+        "damping": swing_damping(record.trace, unit) if "delta" in has else None,
+        "controllers": record.summary["controllers"],
+    }
