@@ -37,8 +37,10 @@ def pair_equations(samples: Sequence[Array], pattern: NDArray[np.bool_]) -> NDAr
     Raises:
         AssemblyError: the equations are structurally singular.
     """
-    smallest = np.min([_row_scaled(np.abs(sample)) for sample in samples], axis=0)
-    weight = np.where(pattern, -np.log(np.maximum(smallest, _NEVER)) + 1.0, 0.0)
+    scaled = [_row_scaled(np.abs(sample)) for sample in samples]
+    smallest, largest = np.min(scaled, axis=0), np.max(scaled, axis=0)
+    # Among entries that vanish at some point, one that is there at others comes before one that never is (an R or X of zero).
+    weight = np.where(pattern, -np.log(np.maximum(smallest, _NEVER * np.maximum(largest, _NEVER))) + 1.0, 0.0)
     weight[pattern] -= weight[pattern].min(initial=0.0) - 1.0
     try:
         rows, cols = min_weight_full_bipartite_matching(sp.csr_matrix(weight))
