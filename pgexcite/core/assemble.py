@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import cast
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -109,7 +109,13 @@ class Symbols:
     def _declare(self, device: Device) -> None:
         self._base[device.path] = self.p.add(f"{device.path}.S_n", device.S_n)
         self.units[f"{device.path}.S_n"] = "MVA"
-        tables = {Kind.STATE: self.x, Kind.ALGEBRAIC: self.z, Kind.DISCRETE: self.d, Kind.SETPOINT: self.u, Kind.CONSTANT: self.p}
+        tables = {
+            Kind.STATE: self.x,
+            Kind.ALGEBRAIC: self.z,
+            Kind.DISCRETE: self.d,
+            Kind.SETPOINT: self.u,
+            Kind.CONSTANT: self.p,
+        }
         for slot, component in device.components.items():
             path = device.component_path(slot)
             symbols: dict[str, Expr] = {}
@@ -158,13 +164,18 @@ class Symbols:
             ]
             names = [item.name for item in component.variables(Kind.ALGEBRAIC)]
             alg += [(f"{path}.{n}", substitute(e)) for n, e in zip(names, equations.alg, strict=True)]
-            updates += [(f"{path}.{i.name}", substitute(equations.update[i.name])) for i in component.variables(Kind.DISCRETE)]
-            holds += [(f"{path}.{i.name}", substitute(equations.hold[i.name])) for i in component.variables(Kind.CONSTANT)]
+            updates += [
+                (f"{path}.{i.name}", substitute(equations.update[i.name])) for i in component.variables(Kind.DISCRETE)
+            ]
+            holds += [
+                (f"{path}.{i.name}", substitute(equations.hold[i.name])) for i in component.variables(Kind.CONSTANT)
+            ]
             if equations.current is not None:
                 current = (substitute(equations.current[0]), substitute(equations.current[1]))
         wired = {port: substitute(value) for port, value in outputs.items()}
         bounded = tuple(
-            (path, Limit(item.label, substitute(item.signal), substitute(item.lower), substitute(item.upper))) for path, item in limits
+            (path, Limit(item.label, substitute(item.signal), substitute(item.lower), substitute(item.upper)))
+            for path, item in limits
         )
         return Stated(tuple(rows), tuple(alg), wired, current, tuple(updates), tuple(holds), bounded)
 
@@ -176,7 +187,12 @@ class Symbols:
             symbol = ca.SX.sym(f"{path}.{variable.name}")
             known[variable.name] = symbol
             inputs.setdefault(variable.name, []).append((path, symbol, variable.default))
-        known |= {"omega_ref": self.omega_ref, "omega_0": 2 * np.pi * self.f_n, "h": self.h, "S_n": self._base[device.path]}
+        known |= {
+            "omega_ref": self.omega_ref,
+            "omega_0": 2 * np.pi * self.f_n,
+            "h": self.h,
+            "S_n": self._base[device.path],
+        }
         if component.has_terminal:
             known["v_re"], known["v_im"] = self.voltage[device.bus]
         copy = self._copies[path]
@@ -191,14 +207,26 @@ def _check_declared(path: str, component: Component, equations: Equations) -> No
     """A component must state one equation for each thing it declares."""
     declared = {kind: [item.name for item in component.variables(kind)] for kind in Kind}
     rows = len(equations.rows())
-    require(rows == len(declared[Kind.STATE]), f"{path}: {len(declared[Kind.STATE])} states are declared, {rows} rows are stated")
+    require(
+        rows == len(declared[Kind.STATE]),
+        f"{path}: {len(declared[Kind.STATE])} states are declared, {rows} rows are stated",
+    )
     count = len(declared[Kind.ALGEBRAIC])
-    require(len(equations.alg) == count, f"{path}: {count} algebraic unknowns are declared, {len(equations.alg)} residuals are stated")
-    for kind, stated in ((Kind.OUTPUT, equations.out), (Kind.DISCRETE, equations.update), (Kind.CONSTANT, equations.hold)):
+    require(
+        len(equations.alg) == count,
+        f"{path}: {count} algebraic unknowns are declared, {len(equations.alg)} residuals are stated",
+    )
+    for kind, stated in (
+        (Kind.OUTPUT, equations.out),
+        (Kind.DISCRETE, equations.update),
+        (Kind.CONSTANT, equations.hold),
+    ):
         missing, extra = set(declared[kind]) - set(stated), set(stated) - set(declared[kind])
         require(not missing, f"{path}: {kind.value} {', '.join(sorted(missing))} declared but not stated")
         require(not extra, f"{path}: {kind.value} {', '.join(sorted(extra))} stated but not declared")
-    require(not component.has_terminal or equations.current is not None, f"{path}: has a terminal but states no current")
+    require(
+        not component.has_terminal or equations.current is not None, f"{path}: has a terminal but states no current"
+    )
 
 
 def _wiring(
@@ -222,7 +250,9 @@ def _wiring(
             return ca.SX(defaults[port])
         if port in resolved:
             return resolved[port]
-        require(port not in pending, f"{device.path}: algebraic loop through the signals {' -> '.join([*pending, port])}")
+        require(
+            port not in pending, f"{device.path}: algebraic loop through the signals {' -> '.join([*pending, port])}"
+        )
         pending.append(port)
         resolved[port] = substitute(ca.SX(outputs[port]))
         pending.pop()
@@ -309,7 +339,9 @@ def _reference(system: System, symbols: Symbols, stated: Mapping[str, Stated]) -
         return (infinite[0] if infinite else "infinite_bus"), ca.SX(1)
     if choice == "centre_of_inertia":
         require(bool(units), "simulation.reference: a centre of inertia needs at least one machine")
-        weights = {n: cast(Expr, getattr(symbols.parameters_of(f"{d.path}.machine"), "H")) * symbols.base(d) for n, d in units.items()}
+        weights = {
+            n: cast(Any, symbols.parameters_of(f"{d.path}.machine")).H * symbols.base(d) for n, d in units.items()
+        }
         total = ca.sum1(ca.vertcat(*weights.values()))
         speed = ca.sum1(ca.vertcat(*(w * stated[units[n].path].outputs["omega"] for n, w in weights.items()))) / total
         return "centre_of_inertia", speed

@@ -87,9 +87,7 @@ def der(x: Expr, rhs: Expr, T: Expr = 1.0, lower: Expr | None = None, upper: Exp
     return Dynamics(x, rhs, T, lower, upper)
 
 
-def lag(
-    u: Expr, x: Expr, *, T: Expr, K: Expr = 1.0, lower: Expr | None = None, upper: Expr | None = None
-) -> Block:
+def lag(u: Expr, x: Expr, *, T: Expr, K: Expr = 1.0, lower: Expr | None = None, upper: Expr | None = None) -> Block:
     """``K / (1 + sT)``; with bounds, the non-windup form of IEEE 421.5 figure E.3. With ``T = 0`` it is ``clip(K u)``."""
     return Block(x, Dynamics(x, K * u - x, T, lower, upper))
 

@@ -306,7 +306,9 @@ def build(source: str, *, only_cached: bool = False) -> Path | None:
             unit = Path(folder) / "stage.c"
             unit.write_text(source)
             built = Path(folder) / target.name
-            done = subprocess.run([cc, *FLAGS, str(unit), "-o", str(built), "-lm"], capture_output=True, text=True, check=False)
+            done = subprocess.run(
+                [cc, *FLAGS, str(unit), "-o", str(built), "-lm"], capture_output=True, text=True, check=False
+            )
             if done.returncode != 0:
                 raise CompilationError(f"{cc} failed: {done.stderr.strip()[:500]}")
             built.replace(target)

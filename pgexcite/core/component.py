@@ -101,7 +101,9 @@ class Component(BaseModel):
                 raise ValueError(f"{low} = {getattr(self, low)} must be below {high} = {getattr(self, high)}")
         for lead, lag in self.proper:
             if getattr(self, lag) == 0 and getattr(self, lead) != 0:
-                raise ValueError(f"{lead} = {getattr(self, lead)} needs {lag} > 0: a lead without a lag has no realisation")
+                raise ValueError(
+                    f"{lead} = {getattr(self, lead)} needs {lag} > 0: a lead without a lag has no realisation"
+                )
         return self
 
     def equations(self, v: Signals) -> Equations:
@@ -149,7 +151,9 @@ def describe_parameters(cls: type[BaseModel]) -> list[dict[str, Any]]:
     records = []
     for name, info in cls.model_fields.items():
         extra = info.json_schema_extra if isinstance(info.json_schema_extra, dict) else {}
-        bounds = {key: getattr(item, key) for item in info.metadata for key in ("ge", "gt", "le", "lt") if hasattr(item, key)}
+        bounds = {
+            key: getattr(item, key) for item in info.metadata for key in ("ge", "gt", "le", "lt") if hasattr(item, key)
+        }
         records.append(
             {
                 "name": name,

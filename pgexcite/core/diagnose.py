@@ -49,7 +49,9 @@ def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healt
     singular = np.linalg.svd(jacobian)
     if settled is None or singular.S[-1] < _NEARLY_SINGULAR * healthy:
         bus = _weakest_bus(kernel.model, singular.Vh[-1])
-        text = f"voltage collapse at bus {bus}: from t = {state.t:.4f} s on no voltage satisfies the network and its loads"
+        text = (
+            f"voltage collapse at bus {bus}: from t = {state.t:.4f} s on no voltage satisfies the network and its loads"
+        )
         return Outcome(Ending.VOLTAGE_COLLAPSE, state.t, f"bus.{bus}", text)
     worst = _worst_equation(kernel, last, p, h)
     text = f"the step after t = {state.t:.4f} s has no solution; the equation furthest from being satisfied is that of {worst}"

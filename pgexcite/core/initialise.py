@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -120,10 +120,13 @@ def _solve_device(
     solution, error = _newton(lambda w: function(w, numbers, d_0), start)
     values = dict(zip(names, solution, strict=True))
     if not error <= _TOLERANCE:
-        text = f"no steady state at P = {terminal.s.real:.4g}, Q = {terminal.s.imag:.4g}, V = {abs(v):.4g} pu (residual {error:.2g})"
+        at = f"P = {terminal.s.real:.4g}, Q = {terminal.s.imag:.4g}, V = {abs(v):.4g} pu"
+        text = f"no steady state at {at} (residual {error:.2g})"
         return values, [Problem(device.path, text, hint="check its parameters against the operating point")]
     checked = np.array(function(solution, numbers, d_0)[2]).ravel().reshape(-1, 3)
-    return values, [fault for (label, *_), row in zip(checks, checked, strict=True) for fault in _violation(label, *row)]
+    return values, [
+        fault for (label, *_), row in zip(checks, checked, strict=True) for fault in _violation(label, *row)
+    ]
 
 
 def _start(device: Device, terminal: Terminal) -> tuple[list[str], Array]:
@@ -210,4 +213,3 @@ def _newton(function: Callable[[Array], Any], start: Array) -> tuple[Array, floa
 def _evaluate(function: Callable[[Array], Any], w: Array) -> tuple[Array, Array]:
     r, jacobian, _ = function(w)
     return np.array(r).ravel(), np.array(jacobian)
-

@@ -122,7 +122,9 @@ def linearise(model: Model, state: State, p: Array) -> Linearisation:
     try:
         response = -np.linalg.solve(g_solved, np.hstack((g_moving, g_u)))
     except np.linalg.LinAlgError:
-        raise PgexciteError("the algebraic equations are singular at this point: there is nothing to linearise") from None
+        raise PgexciteError(
+            "the algebraic equations are singular at this point: there is nothing to linearise"
+        ) from None
     n = int(dynamic.sum())
 
     def eliminate(rows: Array) -> tuple[Array, Array]:
@@ -139,7 +141,10 @@ def linearise(model: Model, state: State, p: Array) -> Linearisation:
 
 
 def _derivatives(model: Model, state: State, p: Array) -> tuple[Array, Array, Array, Array, dict[str, Array]]:
-    x, z, u = (ca.SX.sym(name, len(names)) for name, names in (("x", model.x_names), ("z", model.z_names), ("u", model.u_names)))
+    x, z, u = (
+        ca.SX.sym(name, len(names))
+        for name, names in (("x", model.x_names), ("z", model.z_names), ("u", model.u_names))
+    )
     d, q = ca.SX.sym("d", len(model.d_names)), ca.SX.sym("p", p.size)
     f, mass, lower, upper, g, _, y = model.dae(x, z, d, u, q, 0.0)
     point = ca.vertcat(x, z, u)

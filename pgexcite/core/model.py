@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 class Model:
     """The equations of a system as one CasADi function, with the names of everything in it.
 
-        mass(p) x' = f(x, z, d, u, p),   lower <= x <= upper,   0 = g(x, z, d, u, p),   d+ = update(x, z, d, u, p),   y = h(x, z, d, u, p)
+        mass(p) x' = f(x, z, d, u, p)    lower <= x <= upper    0 = g(x, z, d, u, p)
+        d+ = update(x, z, d, u, p)       y = h(x, z, d, u, p)
 
     Attributes:
         system: what was assembled.
@@ -56,7 +57,14 @@ class Model:
     @cached_property
     def index(self) -> dict[str, dict[str, int]]:
         """Positions by path, for each of ``x z d u p y``."""
-        groups = {"x": self.x_names, "z": self.z_names, "d": self.d_names, "u": self.u_names, "p": self.p_names, "y": self.y_names}
+        groups = {
+            "x": self.x_names,
+            "z": self.z_names,
+            "d": self.d_names,
+            "u": self.u_names,
+            "p": self.p_names,
+            "y": self.y_names,
+        }
         return {key: {name: k for k, name in enumerate(names)} for key, names in groups.items()}
 
     def position(self, group: str, path: str) -> int:

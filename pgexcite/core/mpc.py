@@ -72,7 +72,9 @@ class Problem:
     def stage_cost(self, voltages: Array, speeds: Array, move: Array) -> float:
         """Cost of one sample: ``voltages`` and ``speeds`` at its end, ``move`` at its beginning."""
         return float(
-            self.Q * np.sum((self.V_ref - voltages) ** 2) + self.P * np.sum((1.0 - speeds) ** 2) + self.R * np.sum(move**2)
+            self.Q * np.sum((self.V_ref - voltages) ** 2)
+            + self.P * np.sum((1.0 - speeds) ** 2)
+            + self.R * np.sum(move**2)
         )
 
 

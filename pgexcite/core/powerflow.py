@@ -103,7 +103,9 @@ def solve(system: System) -> PowerFlow:
             return PowerFlow({name: complex(v[k]) for name, k in index.items()}, s, iterations, tuple(held))
     raise PowerFlowError(
         [
-            Problem(path, "its reactive limit and its voltage keep displacing each other; widen Q_min..Q_max or change V")
+            Problem(
+                path, "its reactive limit and its voltage keep displacing each other; widen Q_min..Q_max or change V"
+            )
             for path in held
         ]
     )
@@ -144,7 +146,9 @@ def _specification(system: System, index: Mapping[str, int], held: Mapping[str, 
         buses.Q[k] += np.nan if reactive is None else reactive / system.S_base
         if plan.V is not None and device.path not in held:
             if not np.isnan(buses.V[k]) and abs(buses.V[k] - plan.V) > _TOLERANCE:
-                raise PowerFlowError([Problem(f"{device.path}.V", f"bus {device.bus} is already held at {buses.V[k]:g} pu", plan.V)])
+                raise PowerFlowError(
+                    [Problem(f"{device.path}.V", f"bus {device.bus} is already held at {buses.V[k]:g} pu", plan.V)]
+                )
             buses.V[k] = plan.V
         if plan.angle is not None:
             buses.angle[k] = plan.angle
@@ -158,9 +162,12 @@ def _check_count(buses: _Buses, names: list[str]) -> None:
         return
     loose = [n for k, n in enumerate(names) if np.isnan(buses.V[k]) and np.isnan(buses.Q[k])]
     tight = [n for k, n in enumerate(names) if not np.isnan(buses.V[k]) and not np.isnan(buses.Q[k])]
-    problems = [Problem(f"bus.{n}", "neither V nor Q is given here: give a device at this bus one of them") for n in loose]
+    problems = [
+        Problem(f"bus.{n}", "neither V nor Q is given here: give a device at this bus one of them") for n in loose
+    ]
     problems += [
-        Problem(f"bus.{n}", "V and Q are both given here: leave one out, or leave V out at an infinite bus") for n in tight
+        Problem(f"bus.{n}", "V and Q are both given here: leave one out, or leave V out at an infinite bus")
+        for n in tight
     ]
     if not problems:
         problems = [Problem("system", f"the power flow has {rows} equations for {unknowns} unknowns")]
@@ -227,7 +234,14 @@ def _derivatives(y: sp.csr_matrix, v: Complex, V: Real) -> tuple[sp.csr_matrix, 
 
 
 def _failure(
-    dP: Real, dQ: Real, P_rows: NDArray[np.intp], Q_rows: NDArray[np.intp], V: Real, names: list[str], base: float, why: str
+    dP: Real,
+    dQ: Real,
+    P_rows: NDArray[np.intp],
+    Q_rows: NDArray[np.intp],
+    V: Real,
+    names: list[str],
+    base: float,
+    why: str,
 ) -> PowerFlowError:
     size = np.zeros(len(names))
     size[P_rows] += np.abs(dP)
@@ -271,10 +285,10 @@ def _apply_limits(
             continue
         if device.path in held:
             over = abs(v[index[device.bus]]) > plan.V
-            if over == (held[device.path] == plan.Q_max):
-                if abs(abs(v[index[device.bus]]) - plan.V) > 1e-9:
-                    del held[device.path]
-                    changed = True
+            away = abs(abs(v[index[device.bus]]) - plan.V) > 1e-9
+            if away and over == (held[device.path] == plan.Q_max):
+                del held[device.path]
+                changed = True
             continue
         Q = s[device.path].imag * system.S_base
         limit = min(max(Q, plan.Q_min), plan.Q_max)

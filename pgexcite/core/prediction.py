@@ -1,8 +1,8 @@
 """Predictions: the kernel's own step rolled out over a horizon, with exact forward sensitivities to the moves.
 
 Each stage is differentiated by the implicit function theorem with the same written-out factors that solved it:
-``J dw = -(dr/db db + dr/du du)``. So a prediction is what the simulation will do, to the last bit, and its derivatives are those of the
-discrete-time plant.
+``J dw = -(dr/db db + dr/du du)``. So a prediction is what the simulation will do, to the last bit, and its derivatives are
+those of the discrete-time plant.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pgexcite.core.codegen import build, generate, load
 from pgexcite.core.linear_algebra import SymbolicLU
 from pgexcite.core.model import State
-from pgexcite.core.settings import Compile, Rule
+from pgexcite.core.settings import Rule
 from pgexcite.core.stage import ALPHA, BETA, FROZEN, write_stage
 from pgexcite.core.step import RULES, STARTUP_STEPS, Kernel, bind
 
@@ -32,7 +32,7 @@ class Rollout:
 
     Attributes:
         y: selected outputs at the end of each sample, shape ``(N, n_y)``.
-        dy: derivatives to the moves, shape ``(N, n_y, n_moves * n_u)`` (moves in order, the commands of one move together), or ``None``.
+        dy: derivatives to the moves, shape ``(N, n_y, n_moves * n_u)``, the commands of one move together; or ``None``.
     """
 
     y: Array
@@ -47,8 +47,7 @@ class Predictor:
         commands: positions in ``u`` of the ``n_u`` commands the moves set.
         outputs: positions in ``y`` of the outputs wanted.
         n_moves: number of moves.
-        rule: integration rule.
-        compile: as in ``Settings``.
+        rule: integration rule. The prediction runs as C where the kernel does.
     """
 
     def __init__(
@@ -58,13 +57,12 @@ class Predictor:
         outputs: Sequence[int],
         n_moves: int,
         rule: Rule,
-        compile: Compile = "auto",
     ) -> None:
         self._kernel, self._rule, self._n_moves = kernel, rule, n_moves
         self._commands, self._outputs = np.array(commands, dtype=np.int32), np.array(outputs, dtype=np.int32)
         columns = n_moves * self._commands.size
         self._functions = _write_sensitivities(kernel, self._commands, self._outputs, columns)
-        self._compiled = self._compile(compile, columns)
+        self._compiled = self._compile(columns)
         stage, history, output = self._functions
         k, rows = kernel, (kernel.w.size, kernel.x.size, self._commands.size, self._outputs.size)
         # CasADi keeps matrices column by column, so a row of these arrays is a column of the sensitivity.
@@ -80,9 +78,9 @@ class Predictor:
         self._y = np.zeros(self._outputs.size)
         self._output = bind(output, [k.x, k.z, *given, S, S_c], [self._y, S_y])
 
-    def _compile(self, choice: Compile, columns: int) -> Any:
+    def _compile(self, columns: int) -> Any:
         functions = self._kernel.functions
-        if choice == "never" or functions.newton is None or (choice == "auto" and not self._kernel.compiled):
+        if not self._kernel.compiled or functions.newton is None:
             return None
         sizes = {"n_commands": self._commands.size, "n_columns": columns, "n_selected": self._outputs.size}
         loop = [functions.newton, functions.history, functions.update, functions.outputs]
@@ -173,37 +171,47 @@ class Predictor:
         self._S_c[:] = 0.0
         for sample, (count, h, move) in enumerate(zip(counts, lengths, in_force, strict=True)):
             if sample == 0 or move != in_force[sample - 1]:
-                moved = not np.array_equal(kernel.u[self._commands], moves[move])
-                kernel.u[self._commands] = moves[move]
-                self._point_at(int(move))
-                if moved:
-                    if not kernel.settle_here():
-                        return False
-                    startup = STARTUP_STEPS
-                if sense:
-                    self._sense_settling()
-            for _ in range(count):
-                self._x[:], self._z[:] = kernel.x, kernel.z
-                if not kernel.take(self._rule, h, startup):
+                changed = self._command(int(move), moves, sense=sense)
+                if changed is None:
                     return False
-                if sense:
-                    self._sense_step(euler=self._rule == "trapezoidal" and startup > 0)
-                startup = max(startup - 1, 0)
-                if kernel.d.size and kernel.renew_discrete(h):
-                    startup = STARTUP_STEPS
-                    if sense:
-                        self._sense_settling()
+                startup = STARTUP_STEPS if changed else startup
+            for _ in range(count):
+                stepped = self._take(h, startup, sense=sense)
+                if stepped is None:
+                    return False
+                startup = stepped
             self._output.trigger()
             y[sample] = self._y
             if sense:
                 dy[sample] = self._S_y
         return True
 
-    def _point_at(self, move: int) -> None:
-        """From here on the commands are those of this move."""
-        n = self._commands.size
+    def _command(self, move: int, moves: Array, *, sense: bool) -> bool | None:
+        """Put a move in force; whether it changed anything, ``None`` where the algebraic unknowns have no solution then."""
+        kernel, n = self._kernel, self._commands.size
+        changed = not np.array_equal(kernel.u[self._commands], moves[move])
+        kernel.u[self._commands] = moves[move]
         self._S_c[:] = 0.0
         self._S_c[move * n + np.arange(n), np.arange(n)] = 1.0
+        if changed and not kernel.settle_here():
+            return None
+        if sense:
+            self._sense_settling()
+        return changed
+
+    def _take(self, h: float, startup: int, *, sense: bool) -> int | None:
+        """One step; the startup steps left, ``None`` where it cannot be taken."""
+        kernel = self._kernel
+        self._x[:], self._z[:] = kernel.x, kernel.z
+        if not kernel.take(self._rule, h, startup):
+            return None
+        if sense:
+            self._sense_step(euler=self._rule == "trapezoidal" and startup > 0)
+        if kernel.d.size and kernel.renew_discrete(h):
+            if sense:
+                self._sense_settling()
+            return STARTUP_STEPS
+        return max(startup - 1, 0)
 
     def _sense_settling(self) -> None:
         kernel = self._kernel
@@ -249,7 +257,9 @@ def _write_sensitivities(
     solved = -SymbolicLU(stage.jacobian, kernel.functions.pairing).solve(ca.densify(rhs))
     given = [stage.d, stage.u, stage.p]
     options = {"cse": True}
-    of_stage = ca.Function("stage_sensitivity", [stage.w, stage.b, stage.c, *given, S_b, S_c], [ca.densify(solved)], options)
+    of_stage = ca.Function(
+        "stage_sensitivity", [stage.w, stage.b, stage.c, *given, S_b, S_c], [ca.densify(solved)], options
+    )
     x, z = ca.SX.sym("x", n_x), ca.SX.sym("z", n_z)
     b = kernel.functions.history(x, z, *given, stage.c)[0]
     y = kernel.functions.outputs(x, z, *given)[[int(k) for k in outputs]]

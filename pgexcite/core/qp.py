@@ -39,7 +39,8 @@ class QPSolution:
 class QuadraticProgram:
     """Solves programs of one size.
 
-    Every solve starts cold: the answer depends on nothing but its inputs, so that a run resumed from a snapshot gives the same bits.
+    Every solve starts cold: the answer depends on nothing but its inputs, so that a run resumed from a snapshot gives the same
+    bits.
 
     Args:
         n: number of variables.
@@ -66,7 +67,9 @@ class QuadraticProgram:
         C = self._no_rows if rows is None else rows
         low = self._free if rows_lower is None else rows_lower
         high = self._free if rows_upper is None else rows_upper
-        finite = all(np.isfinite(a).all() for a in (H, g, C)) and not any(np.isnan(a).any() for a in (lower, upper, low, high))
+        finite = all(np.isfinite(a).all() for a in (H, g, C)) and not any(
+            np.isnan(a).any() for a in (lower, upper, low, high)
+        )
         if not finite or (lower > upper).any() or (low > high).any():
             return QPSolution(np.zeros(n), np.zeros(m + n), False, 0)
         qp = proxsuite.proxqp.dense.QP(n, 0, m, True)

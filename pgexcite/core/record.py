@@ -70,7 +70,9 @@ def write_record(result: RunResult, directory: Path, sinks: Iterable[Sink]) -> P
         directory.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{directory.name}-", dir=directory.parent))
     except OSError as error:
-        raise RecordError(f"{directory}: cannot write here ({error.strerror}); name another directory with --out") from error
+        raise RecordError(
+            f"{directory}: cannot write here ({error.strerror}); name another directory with --out"
+        ) from error
     try:
         fresh = work / "new"
         fresh.mkdir()
@@ -165,7 +167,9 @@ def read_record(directory: Path) -> Record:
     """
     directory = Path(directory)
     if not is_record(directory):
-        raise RecordError(f"{directory}: not the record of a run (no {SUMMARY_FILE} of ours); give the directory a run wrote")
+        raise RecordError(
+            f"{directory}: not the record of a run (no {SUMMARY_FILE} of ours); give the directory a run wrote"
+        )
     trace, about = _read(directory)
     outcome = about["outcome"]
     return Record(
@@ -186,7 +190,9 @@ def _read(path: Path) -> tuple[Trace, dict[str, Any]]:
     try:
         table = pq.read_table(file)
     except (OSError, pa.ArrowInvalid) as error:
-        raise RecordError(f"{file}: cannot be read as a trace ({error}); a run writes it with the sink 'parquet'") from error
+        raise RecordError(
+            f"{file}: cannot be read as a trace ({error}); a run writes it with the sink 'parquet'"
+        ) from error
     metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     if metadata.pop("format", None) != FORMAT:
         raise RecordError(f"{file}: a Parquet file, but not the trace of a run (its metadata lack format = {FORMAT!r})")

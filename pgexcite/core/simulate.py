@@ -119,7 +119,13 @@ class Simulation:
             KeyError: no such path; the message names the nearest.
         """
         index = self.model.index
-        for group, values in (("p", self.p), ("u", self.state.u), ("x", self.state.x), ("z", self.state.z), ("d", self.state.d)):
+        for group, values in (
+            ("p", self.p),
+            ("u", self.state.u),
+            ("x", self.state.x),
+            ("z", self.state.z),
+            ("d", self.state.d),
+        ):
             if path in index[group]:
                 return float(values[index[group][path]])
         state = self.state
@@ -182,7 +188,7 @@ class Simulation:
         before = self.state
         segment = self.kernel.advance(before, self.p, self.settings.rule, self.settings.h, n)
         done = segment.x.shape[0]
-        t = (before.k + 1 + np.arange(done)) * self.settings.h
+        t: Array = np.arange(before.k + 1, before.k + 1 + done, dtype=np.float64) * self.settings.h
         lost = self._angles.first_beyond(segment.x, segment.y, self.settings.delta_max_deg)
         keep = done if lost is None else lost[0] + 1
         self._recording.add(t[:keep], segment.x[:keep], segment.z[:keep], segment.d[:keep], before.u, segment.y[:keep])
@@ -192,7 +198,9 @@ class Simulation:
         self.state = segment.state
         if lost is not None:
             row, unit, angle = lost
-            self.state = State(before.k + row + 1, float(t[row]), segment.x[row], segment.z[row], segment.d[row], before.u)
+            self.state = State(
+                before.k + row + 1, float(t[row]), segment.x[row], segment.z[row], segment.d[row], before.u
+            )
             text = f"{unit} lost synchronism at t = {t[row]:.4f} s: its rotor angle reached {angle:.1f} degrees"
             self._end(Outcome(Ending.LOST_SYNCHRONISM, float(t[row]), unit, text))
         elif segment.failed:
@@ -206,7 +214,9 @@ class Simulation:
             for path in (*change.values, *(change.increments or {})):
                 if path not in self.model.index["u"] and path not in self.model.index["p"]:
                     near = _nearest(self.model, path)
-                    problems.append(Problem(path, f"no such parameter or set-point (event at t = {change.t:g} s)", hint=near))
+                    problems.append(
+                        Problem(path, f"no such parameter or set-point (event at t = {change.t:g} s)", hint=near)
+                    )
         if problems:
             raise ConfigError(problems)
 
@@ -252,7 +262,14 @@ class Simulation:
         y = self.kernel.outputs(s, self.initial.p)
         missing = [path for path in controller.measures() if path not in self.model.index["y"]]
         if missing:
-            raise ConfigError([Problem(f"controller.{name}", f"measures {path}, which does not exist", hint=_nearest(self.model, path)) for path in missing])
+            raise ConfigError(
+                [
+                    Problem(
+                        f"controller.{name}", f"measures {path}, which does not exist", hint=_nearest(self.model, path)
+                    )
+                    for path in missing
+                ]
+            )
         surroundings = Surroundings(
             self.settings.h,
             self.settings.rule,
@@ -261,7 +278,9 @@ class Simulation:
         )
         plant = None
         if controller.information == "perfect":
-            plant = Plant(self.model, Kernel(self.model, s, self.initial.p, self.settings.compile), self.initial.p.copy())
+            plant = Plant(
+                self.model, Kernel(self.model, s, self.initial.p, self.settings.compile), self.initial.p.copy()
+            )
         names = tuple(controller.measures())
         columns = np.array([self.model.position("y", path) for path in names], dtype=int)
         return _Running(controller, controller.start(surroundings, plant), every, columns, names)
@@ -311,7 +330,8 @@ class Simulation:
         """The run so far as a record to be written."""
         outcome = self.outcome or Outcome(Ending.COMPLETED, self.state.t, "", "not run to its end")
         controllers = {
-            name: ControllerStatistics(len(r.t), tuple(r.solve_ms), r.fallbacks, r.cost) for name, r in self._running.items()
+            name: ControllerStatistics(len(r.t), tuple(r.solve_ms), r.fallbacks, r.cost)
+            for name, r in self._running.items()
         }
         system = self.model.system
         return RunResult(title, config or {}, system, outcome, self.trace(), self.state.k, self.wall_time, controllers)
@@ -321,7 +341,9 @@ class Simulation:
     def save(self, path: Path) -> None:
         """Write the present point, parameters and the controllers' memories; ``resume`` goes on from it bit for bit."""
         memory = {
-            f"controller:{name}:{key}": value for name, r in self._running.items() for key, value in r.session.memory().items()
+            f"controller:{name}:{key}": value
+            for name, r in self._running.items()
+            for key, value in r.session.memory().items()
         }
         memory["applied"] = np.array(len(self._changes) - len(self._pending))
         self.state.save(path, self.model, self.p, memory)
@@ -366,8 +388,12 @@ class _Angles:
         self.names = [d.path for d in machines]
         self.columns = np.array([model.position("y", f"{d.path}.delta") for d in machines], dtype=int)
         inertia = np.array([float(getattr(d.components["machine"], "H", 0.0)) * d.S_n for d in machines])
-        fixed = [d.path for d in model.system.devices if d.components and next(iter(d.components.values())).role == "source"]
-        self._theta = [model.position("x", f"{path}.theta") for path in fixed if f"{path}.theta" in model.index["x"]][:1]
+        fixed = [
+            d.path for d in model.system.devices if d.components and next(iter(d.components.values())).role == "source"
+        ]
+        self._theta = [model.position("x", f"{path}.theta") for path in fixed if f"{path}.theta" in model.index["x"]][
+            :1
+        ]
         self._fixed = bool(fixed) or bool(np.any(inertia == 0)) or not machines
         self._weights = inertia / inertia.sum() if not self._fixed else None
 

@@ -1,9 +1,9 @@
 """The implicit stage all rules of the kernel share, written out as one straight-line Newton iteration.
 
-All three rules solve stages of one form, ``M x+ - b - c f(x+, z+) = 0`` with ``0 = g(x+, z+)``, where ``b`` and the scalar ``c`` are the
-rule's: backward Euler has ``b = M x`` and ``c = h``; the trapezoidal rule ``b = M x + c f(x, z)`` and ``c = h/2``; TR-BDF2 (Bank et al.
-1985; Hosea and Shampine 1996) is a trapezoidal stage over ``gamma h`` and a BDF2 stage, both with ``c = gamma h/2``. With ``c = 0+``
-the same stage solves the algebraic unknowns again at fixed states.
+All three rules solve stages of one form, ``M x+ - b - c f(x+, z+) = 0`` with ``0 = g(x+, z+)``, where ``b`` and the scalar ``c``
+are the rule's: backward Euler has ``b = M x`` and ``c = h``; the trapezoidal rule ``b = M x + c f(x, z)`` and ``c = h/2``;
+TR-BDF2 (Bank et al. 1985; Hosea and Shampine 1996) is a trapezoidal stage over ``gamma h`` and a BDF2 stage, both with
+``c = gamma h/2``. With ``c = 0+`` the same stage solves the algebraic unknowns again at fixed states.
 
 A row with ``M = 0`` has ``b = 0``: it is imposed at the new point only. A state with a non-windup limit takes the projected form
 ``x+ = clip(x+ - s r(x+), lower, upper)`` of its row ``r``, for which Newton is semismooth and cannot chatter.
@@ -41,8 +41,8 @@ class StageFunctions:
     """The compiled pieces of a step.
 
     Attributes:
-        newton: ``(w, b, c, d, u, p) -> (w_next, norm2)``, one Newton iteration on ``w = (x+, z+)`` and the squared residual at ``w``;
-            ``None`` above ``LARGEST_WRITTEN_OUT`` unknowns.
+        newton: ``(w, b, c, d, u, p) -> (w_next, norm2)``, one Newton iteration on ``w = (x+, z+)`` and the squared residual at
+            ``w``; ``None`` above ``LARGEST_WRITTEN_OUT`` unknowns.
         history: ``(x, z, d, u, p, c) -> (b, mass)``.
         residual: ``(w, b, c, d, u, p) -> (r, J)`` for the numeric solver.
         update: ``(x, z, d, u, p, h) -> d_next``.
@@ -135,7 +135,7 @@ def build_stage_functions(model: Model, state: State, p: Array, stage: Stage | N
 
 
 def write_history(model: Model) -> ca.Function:
-    """``(x, z, d, u, p, c) -> (b, mass)``: ``M x + c f`` with the slope of a limited state projected and that of an algebraic row zero."""
+    """``(x, z, d, u, p, c) -> (b, mass)``: ``M x + c f``, slopes of limited states projected, those of algebraic rows zero."""
     x, z = ca.SX.sym("x", len(model.x_names)), ca.SX.sym("z", len(model.z_names))
     c = ca.SX.sym("c")
     d, u, p = ca.SX.sym("d", len(model.d_names)), ca.SX.sym("u", len(model.u_names)), ca.SX.sym("p", len(model.p_names))
@@ -166,4 +166,3 @@ def _sample_points(model: Model, state: State, p: Array) -> list[tuple[Array | f
     points: list[tuple[Array | float, ...]] = [(w, b, c, d, u, p) for c in (FROZEN, 1e-3, 0.5)]
     points += [(beyond[0], b + 1e3, 1e-3, d, u, p), (beyond[1], b - 1e3, 1e-3, d, u, p), (w, b, 1e-3, d, u, fault)]
     return points
-

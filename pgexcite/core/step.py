@@ -68,9 +68,9 @@ def bind(function: Any, arguments: list[Array], results: list[Array]) -> Bound:
     """Bind a CasADi function to contiguous float64 arrays, which it reads and writes in place."""
     buffer, trigger = function.buffer()
     for k, array in enumerate(arguments):
-        buffer.set_arg(k, memoryview(array))
+        buffer.set_arg(k, array.data)
     for k, array in enumerate(results):
-        buffer.set_res(k, memoryview(array))
+        buffer.set_res(k, array.data)
     return Bound(trigger, [function, buffer, *arguments, *results])
 
 
@@ -123,8 +123,17 @@ class Kernel:
     def constants(self) -> dict[str, object]:
         """What the C templates need to know of this kernel."""
         sizes = {"n_x": self._n_x, "n_z": self.z.size, "n_d": self.d.size, "n_u": self.u.size, "n_y": self.y.size}
-        rule = {"gamma": repr(GAMMA), "alpha": repr(ALPHA), "beta": repr(BETA), "extrapolate": repr((1 - GAMMA) / GAMMA)}
-        limits = {"max_iterations": MAX_ITERATIONS, "tolerance2": repr(TOLERANCE * TOLERANCE), "startup_steps": STARTUP_STEPS}
+        rule = {
+            "gamma": repr(GAMMA),
+            "alpha": repr(ALPHA),
+            "beta": repr(BETA),
+            "extrapolate": repr((1 - GAMMA) / GAMMA),
+        }
+        limits = {
+            "max_iterations": MAX_ITERATIONS,
+            "tolerance2": repr(TOLERANCE * TOLERANCE),
+            "startup_steps": STARTUP_STEPS,
+        }
         return sizes | rule | limits | {"frozen": repr(FROZEN), "moved": repr(MOVED)}
 
     def _compile(self, choice: Compile) -> CompiledLoop | None:

@@ -33,7 +33,9 @@ class MPC(BaseModel):
     source: ClassVar[str] = '"Model Predictive Control for Field Excitation of Synchronous Generators", section 3'
 
     unit: str = Field(description="unit whose excitation is controlled")
-    command: Literal["e_fd", "v_ref"] = Field("e_fd", description="what it commands: the field voltage or the regulator's set-point")
+    command: Literal["e_fd", "v_ref"] = Field(
+        "e_fd", description="what it commands: the field voltage or the regulator's set-point"
+    )
     backend: str = Field("nmpc", description="registered name of the MPC backend")
     options: Mapping[str, Any] = Field(default_factory=dict, description="parameters of the backend")
     dt: float = par(0.05, "s", "sample time", gt=0)
@@ -92,7 +94,9 @@ class MPC(BaseModel):
             raise ConfigError([Problem("controller.command", text, self.command, hint)])
         if not self.u_min <= u_0 <= self.u_max:
             text = f"the initial value of {self.setpoint} is outside u_min = {self.u_min:g} .. u_max = {self.u_max:g}"
-            raise ConfigError([Problem("controller", text, round(u_0, 5), "widen the bounds or move the operating point")])
+            raise ConfigError(
+                [Problem("controller", text, round(u_0, 5), "widen the bounds or move the operating point")]
+            )
         problem = ControlProblem(
             dt=self.dt,
             N_p=self.N_p,

@@ -64,8 +64,7 @@ class _Solver:
         model = plant.model
         commands = [model.position("u", path) for path in problem.commands]
         outputs = [model.position("y", path) for path in (*problem.voltages, *problem.speeds)]
-        compile = "auto" if plant.kernel.compiled else "never"
-        self._predictor = Predictor(plant.kernel, commands, outputs, problem.N_c, surroundings.rule, compile)
+        self._predictor = Predictor(plant.kernel, commands, outputs, problem.N_c, surroundings.rule)
         self._in_force = problem.moves_per_sample()
         n = problem.N_c * len(commands)
         bounded = bool(np.isfinite(problem.du_max).any())
@@ -92,7 +91,9 @@ class _Solver:
             plan = np.clip(np.tile(u_last, (problem.N_c, 1)), problem.u_min, problem.u_max)
             rollout = self._roll(sample, plan)
         if rollout is None:
-            return Solution(Status.PREDICTION_FAILED, plan, np.inf, 0, np.inf, {"total": 1e3 * (time.perf_counter() - began)})
+            return Solution(
+                Status.PREDICTION_FAILED, plan, np.inf, 0, np.inf, {"total": 1e3 * (time.perf_counter() - began)}
+            )
         cost = self._cost(rollout, plan, u_last)
         while iteration < self._config.max_iterations:
             iteration += 1
@@ -123,7 +124,8 @@ class _Solver:
         return np.vstack((self._plan[1:], self._plan[-1:]))
 
     def _roll(self, sample: Sample, plan: Array) -> Rollout | None:
-        assert sample.state is not None and sample.p is not None
+        assert sample.state is not None
+        assert sample.p is not None
         return self._predictor.roll(
             sample.state, sample.p, plan, self._counts, self._lengths, self._in_force, derivatives=True
         )
