@@ -61,14 +61,13 @@ def entity_of(*names: str) -> str:
     return str(rr.new_entity_path([*names]))
 
 
-def application_id(title: str, structure: Iterable[str]) -> str:
+def application_id(structure: Iterable[str]) -> str:
     """An application id that changes with what is shown.
 
     The viewer keeps one layout per application id: an id of its own for every structure keeps a recording from being shown in
     the layout of another one.
     """
-    digest = hashlib.sha256("\n".join(structure).encode()).hexdigest()[:8]
-    return f"{title or 'pgexcite run'} [{digest}]"
+    return "pgexcite-" + hashlib.sha256("\n".join(structure).encode()).hexdigest()[:8]
 
 
 def new_stream(title: str, structure: Iterable[str]) -> Any:
@@ -77,8 +76,8 @@ def new_stream(title: str, structure: Iterable[str]) -> Any:
 
     import rerun as rr
 
-    stream = rr.RecordingStream(application_id(title, structure), recording_id=str(uuid4()))
-    stream.send_recording_name(title or "pgexcite run")
+    stream = rr.RecordingStream(application_id(structure), recording_id=str(uuid4()))
+    stream.send_recording_name(title or "run")
     return stream
 
 

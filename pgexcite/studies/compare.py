@@ -32,7 +32,8 @@ class Comparison:
 
     Attributes:
         rows: one per run and unit: ``label``, ``unit``, ``outcome``, the unit's figures of ``summary.json``, and ``first_swing_deg``,
-            ``recovery_5`` and ``recovery_1`` [s after the last event], ``damping`` (of the swing), ``controllers``.
+            ``recovery_5`` and ``recovery_1`` [s after the last event], ``damping`` (of the swing), and over all controllers of the run
+            ``fallbacks`` and the largest ``solve_ms_p99``.
         picture: the PNG.
         recording: the ``.rrd``.
     """
@@ -145,6 +146,8 @@ def _title(records: Sequence[Record]) -> str:
 
 def _row(label: str, record: Record, unit: str) -> dict[str, Any]:
     has = record.trace.signals(f"unit.{unit}")
+    controllers = record.summary["controllers"].values()
+    solved = [item["solve_ms"]["p99"] for item in controllers if item["solve_ms"]]
     return {
         "label": label,
         "unit": unit,
@@ -155,5 +158,6 @@ def _row(label: str, record: Record, unit: str) -> dict[str, Any]:
         "recovery_5": recovery_time(record.trace, unit, 0.05) if "v_t" in has else None,
         "recovery_1": recovery_time(record.trace, unit, 0.01) if "v_t" in has else None,
         "damping": swing_damping(record.trace, unit) if "delta" in has else None,
-        "controllers": record.summary["controllers"],
+        "solve_ms_p99": max(solved, default=None),
+        "fallbacks": sum(item["fallbacks"] for item in controllers),
     }

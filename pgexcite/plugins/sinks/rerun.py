@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -68,7 +69,7 @@ def serve(title: str, system: System, signals: Sequence[str], *, port: int = 987
         title: of the run.
         system: what is simulated.
         signals: paths of the signals the trace will have.
-        port: to listen at.
+        port: to listen at; when something else listens there already, a free one is taken instead.
         bind: address to listen on; this machine only, unless told otherwise.
 
     Returns:
@@ -78,6 +79,19 @@ def serve(title: str, system: System, signals: Sequence[str], *, port: int = 987
 
     overview = Overview.of(system, signals)
     stream = recording.new_stream(title, signals)
+    port = _free_port(bind, port)
     stream.set_sinks(rr.GrpcServerSink(bind_ip=bind, port=port), default_blueprint=overview.blueprint())
     overview.draw_fixed(stream)
     return LiveView(stream, overview, f"rerun+http://{bind}:{port}/proxy")
+
+
+def _free_port(bind: str, wanted: int) -> int:
+    """``wanted``, or any free port where it is taken: rerun itself reports a taken port on stderr only, and serves nothing."""
+    for port in (wanted, 0):
+        with socket.socket() as probe:
+            try:
+                probe.bind((bind, port))
+            except OSError:
+                continue
+            return int(probe.getsockname()[1])
+    return wanted
