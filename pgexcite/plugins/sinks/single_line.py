@@ -75,7 +75,7 @@ def place_buses(system: System) -> dict[str, Points]:
         links[index[branch.from_bus], index[branch.to_bus]] = 1.0
     hops = shortest_path(links, directed=False, unweighted=True)
     hops[np.isinf(hops)] = np.max(hops[np.isfinite(hops)]) + 2.0
-    position = _classical_scaling(hops)
+    position = _apart(_classical_scaling(hops))
     weight = np.where(hops > 0, 1.0 / np.maximum(hops, 1.0) ** 2, 0.0)
     laplacian = np.linalg.pinv(np.diag(weight.sum(axis=1)) - weight)
     for _ in range(_STRESS_STEPS if n > 2 else 0):
@@ -95,6 +95,14 @@ def _classical_scaling(distance: Points) -> Points:
     for axis in range(min(2, n)):
         plane[:, axis] = math.sqrt(max(values[-1 - axis], 0.0)) * vectors[:, -1 - axis]
     return plane
+
+
+def _apart(position: Points) -> Points:
+    """Twins (two stubs of one bus) moved off one another, so that the majorisation can tell them apart."""
+    gap = np.linalg.norm(position[:, None] - position[None], axis=2) + np.eye(len(position))
+    twin = np.min(gap, axis=1) < 0.1 if len(position) > 1 else np.zeros(len(position), dtype=bool)
+    turn = 2.399963 * np.arange(len(position))  # the golden angle: no two in one direction
+    return position + 0.2 * twin[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
 
 
 def _upright(system: System, position: Points, index: dict[str, int]) -> Points:
