@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _EPS = 1e-10
+_GAP = 1e-8
 _MAX_ITERATIONS = 60
 _MAX_INNER_ITERATIONS = 60
 
@@ -75,6 +76,8 @@ class QuadraticProgram:
         qp = proxsuite.proxqp.dense.QP(n, 0, m, True)
         settings = qp.settings
         settings.eps_abs, settings.eps_rel = _EPS, 0.0
+        # Without the gap a point 4e-7 off an active bound counts as solved.
+        settings.check_duality_gap, settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = True, _GAP, 0.0
         settings.max_iter, settings.max_iter_in = _MAX_ITERATIONS, _MAX_INNER_ITERATIONS
         settings.initial_guess = proxsuite.proxqp.InitialGuess.NO_INITIAL_GUESS
         # Bounds that do not exist are large numbers to ProxQP, not infinities.

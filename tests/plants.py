@@ -1,0 +1,46 @@
+"""Plants the kernel's tests run on, built from the shipped components."""
+
+from __future__ import annotations
+
+from pgexcite.core.component import Component
+from pgexcite.core.network import Bus, Line, Transformer
+from pgexcite.core.system import Device, Schedule, System
+from pgexcite.plugins.exciters.constant import ConstantField
+from pgexcite.plugins.exciters.st1a import ST1A
+from pgexcite.plugins.governors.constant import ConstantTorque
+from pgexcite.plugins.machines.salient_pole import SalientPole
+from pgexcite.plugins.sources.infinite_bus import InfiniteBus
+from pgexcite.plugins.stabilisers.kundur import KundurPSS
+
+REGULATED: dict[str, Component] = {
+    "exciter": ST1A(T_R=0.02, K_A=200.0, V_RMIN=-3.85, V_RMAX=3.85),
+    "stabiliser": KundurPSS(K_STAB=9.5, T_W=1.4, T_1=0.154, T_2=0.033, V_SMAX=0.2, V_SMIN=-0.2),
+}
+"""Static exciter with stabiliser, tuned as in Kundur's example 12.5, ceiling twice the field voltage of rated load."""
+
+
+def kobbelv(reference: str = "auto", S_base: float = 175.0, **slots: Component) -> System:
+    """The paper's plant: 175 MVA hydro unit, transformer, line, infinite bus whose voltage follows from P, Q and V_t = 1."""
+    components: dict[str, Component] = {
+        "machine": SalientPole(),
+        "exciter": ConstantField(),
+        "governor": ConstantTorque(),
+    }
+    z = S_base / 175.0
+    return System(
+        S_base=S_base,
+        f_n=50.0,
+        buses={"G2": Bus(), "HV": Bus(), "INF": Bus()},
+        lines={"L1": Line(**{"from": "HV", "to": "INF"}, X=0.15 * z)},
+        transformers={"T1": Transformer(**{"from": "G2", "to": "HV"}, X=0.12 * z)},
+        devices=(
+            Device("unit.G2", "G2", 175.0, components | slots, Schedule(P=0.86 * 175, Q=0.51 * 175, V=1.0)),
+            Device("infinite_bus.grid", "INF", S_base, {"": InfiniteBus()}, Schedule(angle=0.0)),
+        ),
+        reference=reference,
+    )
+
+
+def regulated(**slots: Component) -> System:
+    """The same plant under ST1A with a stabiliser."""
+    return kobbelv(**(REGULATED | slots))

@@ -1,0 +1,114 @@
+"""The MPC controller in closed loop: bounds, fallbacks, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plants import kobbelv, regulated
+from pydantic import ValidationError
+
+from pgexcite.core.errors import ConfigError
+from pgexcite.core.events import Fault
+from pgexcite.core.mpc import Solution, Status
+from pgexcite.core.settings import Settings
+from pgexcite.core.simulate import Simulation
+from pgexcite.plugins.controllers.mpc import MPC
+
+FAULT = Fault(type="fault", t=0.2, bus="HV", R=0.02, duration=0.1)
+COMMAND = "unit.G2.exciter.e_fd_ref"
+
+
+def run(t_end=1.5, system=None, **options):
+    sim = Simulation(
+        system or kobbelv(),
+        Settings(t_end, 0.005, "tr_bdf2", "never"),
+        FAULT.changes(),
+        {"mpc": MPC(**({"unit": "G2"} | options))},
+    )
+    sim.run()
+    return sim
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"N_c": 5}, {"u_max": 2.2, "u_min": 1.5}, {"N_p": 10, "N_c": 2, "du_max": 0.2}]
+)
+def test_no_command_leaves_its_bounds(options):
+    sim = run(**options)
+    config = MPC(unit="G2", **options)
+    e_fd = sim.trace()[COMMAND]
+    assert e_fd.max() <= config.u_max
+    assert e_fd.min() >= config.u_min
+    assert np.abs(np.diff(e_fd)).max() <= config.du_max + 1e-8
+    assert np.ptp(e_fd) > 0.3  # it does act
+
+
+def test_it_brings_the_voltage_back():
+    sim, free = run(6.0), Simulation(kobbelv(), Settings(6.0, 0.005, "tr_bdf2", "never"), FAULT.changes())
+    free.run()
+    under_mpc, constant = (np.abs(s.trace()["unit.G2.v_t"] - 1.0) for s in (sim, free))
+    assert under_mpc[-200:].max() < 1e-3  # measured 4e-4
+    assert under_mpc.sum() < constant.sum()
+
+
+def test_secondary_control_moves_the_set_point():
+    sim = run(3.0, regulated(), command="v_ref", u_min=0.9, u_max=1.05, dt=0.1, V_ref=0.99)
+    assert abs(sim.get("unit.G2.v_t") - 0.99) < 2e-3  # measured 4e-4
+    assert sim.trace()["unit.G2.exciter.v_ref"].min() >= 0.9
+
+
+class _Broken:
+    """A solver that fails in a given way after a few good samples."""
+
+    def __init__(self, good, how):
+        self._good, self._how, self._count = good, how, 0
+
+    def solve(self, sample, u_last):
+        self._count += 1
+        if self._count <= 3:
+            return self._good.solve(sample, u_last)
+        return {
+            "status": Solution(Status.QP_FAILED, np.zeros((5, 1)), np.inf, 0, np.inf),
+            "nan": Solution(Status.CONVERGED, np.full((5, 1), np.nan), 0.0, 1, 0.0),
+            "bounds": Solution(Status.CONVERGED, np.full((5, 1), 50.0), 0.0, 1, 0.0),
+        }[self._how]
+
+    def memory(self):
+        return {}
+
+
+@pytest.mark.parametrize("how", ["status", "nan", "bounds"])
+def test_a_bad_plan_never_reaches_the_plant(how):
+    sim = Simulation(
+        kobbelv(),
+        Settings(1.0, 0.005, "tr_bdf2", "never"),
+        FAULT.changes(),
+        {"mpc": MPC(unit="G2", N_c=5, max_reuse=2)},
+    )
+    session = sim._running["mpc"].session
+    session._solver = _Broken(session._solver, how)
+    outcome = sim.run()
+    e_fd = sim.trace()[COMMAND]
+    assert outcome.ending.value == "completed"
+    assert np.isfinite(e_fd).all()
+    assert np.abs(e_fd).max() <= 3.2
+    assert sim.result().controllers["mpc"].fallbacks == 17
+    log = [entry.text for entry in sim.trace().log if entry.kind == "controller"]
+    assert sum("the last plan is followed" in text for text in log) == 2
+    assert sum("the last command is held" in text for text in log) == 15
+
+
+def test_refusals_name_the_place():
+    with pytest.raises(ConfigError, match="unit.G2.exciter.e_fd_ref, which does not exist"):
+        run(system=regulated())
+    with pytest.raises(ConfigError, match="outside u_min"):
+        run(u_max=1.0)
+    with pytest.raises(ConfigError, match="whole multiple of the step"):
+        run(dt=0.052)
+    with pytest.raises(ConfigError, match="nearest"):
+        run(unit="G3")
+    with pytest.raises(ValidationError, match="N_c = 9"):
+        MPC(unit="G2", N_c=9)
+    with pytest.raises(ValidationError, match="nmpc"):
+        MPC(unit="G2", backend="nmcp")
+    with pytest.raises(ValidationError, match="max_iteration"):
+        MPC(unit="G2", options={"max_iteration": 3})

@@ -1,0 +1,197 @@
+"""The perfect-model NMPC: its QP, its convergence, and the same problem solved by an independent NLP solver."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from plants import kobbelv
+
+from pgexcite.core.controller import Plant, Sample, Surroundings
+from pgexcite.core.events import Fault
+from pgexcite.core.mpc import Problem, Status
+from pgexcite.core.qp import QuadraticProgram
+from pgexcite.core.settings import Settings
+from pgexcite.core.simulate import Simulation
+from pgexcite.core.step import Kernel
+from pgexcite.plugins.mpc_backends.nmpc import NMPC
+
+FAULT = Fault(type="fault", t=0.1, bus="HV", R=0.02, duration=0.1)
+COMMAND = "unit.G2.exciter.e_fd_ref"
+H = 0.005
+
+
+def make(t, rule="tr_bdf2", **changes):
+    """The plant at ``t`` of a fault run, the problem, and a solver of it."""
+    sim = Simulation(kobbelv(), Settings(1.0, H, rule, "never"), FAULT.changes())
+    sim.run(until=t)
+    model = sim.model
+    values = {
+        "dt": 0.05, "N_p": 5, "N_c": 3, "commands": (COMMAND,), "voltages": ("unit.G2.v_t",), "speeds": ("unit.G2.omega",),
+        "Q": 300.0, "P": 5.0, "R": 0.01, "u_min": np.array([-3.2]), "u_max": np.array([3.2]), "du_max": np.array([np.inf]),
+        "V_ref": np.array([1.0]),
+    }  # fmt: skip
+    problem = Problem(**(values | changes))
+    surroundings = Surroundings(H, rule, dict(zip(model.u_names, sim.state.u, strict=True)), {})
+    plant = Plant(model, Kernel(model, sim.initial.state, sim.initial.p, "never"), sim.p)
+    solver = NMPC(max_iterations=100, tolerance=1e-9).start(problem, surroundings, plant)
+    return sim, problem, solver
+
+
+def solve(sim, solver):
+    u = np.array([sim.get(COMMAND)])
+    return u, solver.solve(Sample(sim.state.t, {}, sim.state, sim.p), u)
+
+
+def gradient(sim, problem, plan, u_last):
+    """Gradient of the true cost by central differences of plain simulation runs."""
+
+    def cost(moves):
+        kernel, state, total, last = sim.kernel, sim.state, 0.0, u_last[0]
+        k = sim.model.position("u", COMMAND)
+        for j in range(problem.N_p):
+            value = moves[min(j, problem.N_c - 1), 0]
+            if value != state.u[k]:
+                u = state.u.copy()
+                u[k] = value
+                state = kernel.settle(state.with_(u=u), sim.p)
+            state = kernel.advance(state, sim.p, "tr_bdf2", H, round(problem.dt / H)).state
+            y = kernel.outputs(state, sim.p)
+            v, omega = y[sim.model.position("y", "unit.G2.v_t")], y[sim.model.position("y", "unit.G2.omega")]
+            total += problem.Q * (1.0 - v) ** 2 + problem.P * (1 - omega) ** 2
+        for j in range(problem.N_c):
+            total += problem.R * (moves[j, 0] - last) ** 2
+            last = moves[j, 0]
+        return total
+
+    e, result = 1e-5, []
+    for j in range(problem.N_c):
+        up, down = plan.copy(), plan.copy()
+        up[j] += e
+        down[j] -= e
+        result.append((cost(up) - cost(down)) / (2 * e))
+    return np.array(result), cost(plan)
+
+
+@pytest.mark.parametrize("t", [0.12, 0.22, 0.4])
+@pytest.mark.parametrize("weights", [{}, {"Q": 3.0, "R": 1.0}])
+def test_converged_plan_satisfies_the_optimality_conditions_of_the_true_problem(t, weights):
+    sim, problem, solver = make(t, **weights)
+    u_last, solution = solve(sim, solver)
+    assert solution.status is Status.CONVERGED
+    slope, cost = gradient(sim, problem, solution.u, u_last)
+    assert solution.cost == pytest.approx(cost, rel=1e-12)
+    plan, scale = solution.u.ravel(), max(1.0, abs(cost))
+    inside = (plan > -3.2 + 1e-9) & (plan < 3.2 - 1e-9)
+    assert np.all(np.abs(slope[inside]) < 1e-5 * scale)  # measured 2e-7
+    assert np.all(slope[plan >= 3.2 - 1e-9] <= 1e-6)
+    assert np.all(slope[plan <= -3.2 + 1e-9] >= -1e-6)
+
+
+def ipopt_plan(sim, problem, u_last):
+    """The same discretised problem as one sparse NLP: every TR-BDF2 stage of every step an equality, solved by ipopt."""
+    model, rule_gamma = sim.model, 2 - np.sqrt(2)
+    alpha, beta = 1 / (rule_gamma * (2 - rule_gamma)), (1 - rule_gamma) ** 2 / (rule_gamma * (2 - rule_gamma))
+    n_x, n_z = len(model.x_names), len(model.z_names)
+    k = model.position("u", COMMAND)
+    iv, iw = model.position("y", "unit.G2.v_t"), model.position("y", "unit.G2.omega")
+    U = [ca.MX.sym(f"u{j}") for j in range(problem.N_c)]
+    unknowns, start, equalities, cost = list(U), [u_last[0]] * problem.N_c, [], 0
+    x, z, guess = ca.DM(sim.state.x), ca.DM(sim.state.z), sim.state
+    c = rule_gamma * H / 2
+    for j in range(problem.N_p):
+        u = ca.vertcat(
+            *[U[min(j, problem.N_c - 1)] if i == k else float(sim.state.u[i]) for i in range(sim.state.u.size)]
+        )
+        for _ in range(round(problem.dt / H)):
+            f0, mass = model.dae(x, z, model.d_0, u, sim.p, 0.0)[:2]
+            guess = sim.kernel.advance(guess, sim.p, "tr_bdf2", H, 1).state
+            stages = []
+            for _ in range(2):
+                xs, zs = ca.MX.sym("x", n_x), ca.MX.sym("z", n_z)
+                unknowns += [xs, zs]
+                start += [*guess.x, *guess.z]
+                stages.append((xs, zs))
+            (xm, zm), (x1, z1) = stages
+            fm, _, _, _, gm, *_ = model.dae(xm, zm, model.d_0, u, sim.p, 0.0)
+            f1, _, _, _, g1, *_ = model.dae(x1, z1, model.d_0, u, sim.p, 0.0)
+            equalities += [mass * (xm - x) - c * (f0 + fm), gm, mass * (x1 - alpha * xm + beta * x) - c * f1, g1]
+            x, z = x1, z1
+        y = model.dae(x, z, model.d_0, u, sim.p, 0.0)[6]
+        cost += problem.Q * (1.0 - y[iv]) ** 2 + problem.P * (1 - y[iw]) ** 2
+    last = u_last[0]
+    for move in U:
+        cost += problem.R * (move - last) ** 2
+        last = move
+    w = ca.vertcat(*unknowns)
+    options = {"ipopt.print_level": 0, "print_time": False, "ipopt.tol": 1e-11, "ipopt.bound_relax_factor": 0.0}
+    solver = ca.nlpsol("nlp", "ipopt", {"x": w, "f": cost, "g": ca.vertcat(*equalities)}, options)
+    n = w.numel()
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    low[: problem.N_c], high[: problem.N_c] = problem.u_min[0], problem.u_max[0]
+    found = solver(x0=start, lbx=low, ubx=high, lbg=0, ubg=0)
+    assert solver.stats()["success"]
+    return np.array(found["x"]).ravel()[: problem.N_c], float(found["f"])
+
+
+@pytest.mark.parametrize("t", [0.12, 0.22, 0.4])
+@pytest.mark.parametrize("changes", [{"N_c": 1}, {"N_c": 3, "Q": 3.0, "R": 0.1}])
+def test_converged_plan_is_that_of_an_independent_solver(t, changes):
+    sim, problem, solver = make(t, **changes)
+    u_last, solution = solve(sim, solver)
+    expected, cost = ipopt_plan(sim, problem, u_last)
+    assert solution.status is Status.CONVERGED
+    assert np.abs(solution.u.ravel() - expected).max() < 1e-4  # measured 2e-8
+    assert solution.cost == pytest.approx(cost, rel=1e-8)
+
+
+def test_bounds_on_the_move_hold():
+    sim, problem, solver = make(0.22, du_max=np.array([0.3]))
+    u_last, solution = solve(sim, solver)
+    moves = np.diff(solution.u.ravel(), prepend=u_last)
+    assert np.abs(moves).max() == pytest.approx(0.3, abs=1e-8)
+
+
+def test_qp_satisfies_its_optimality_conditions():
+    rng = np.random.default_rng(1)
+    for n, m in ((1, 0), (5, 0), (8, 8), (20, 20)):
+        for _ in range(20):
+            A = rng.normal(size=(n, n))
+            H, g = A @ A.T + 1e-3 * np.eye(n), 10 * rng.normal(size=n)
+            lower, upper = -rng.random(n), rng.random(n)
+            rows = rng.normal(size=(m, n)) if m else None
+            reach = np.full(m, 0.5)
+            solution = QuadraticProgram(n, m).solve(H, g, lower, upper, rows, -reach, reach)
+            assert solution.solved
+            x, y = solution.x, solution.multipliers
+            C = np.vstack((rows, np.eye(n))) if m else np.eye(n)
+            low, high = np.concatenate((-reach, lower)), np.concatenate((reach, upper))
+            value = C @ x
+            assert np.abs(H @ x + g + C.T @ y).max() < 1e-8  # stationarity
+            assert np.all(value <= high + 1e-9)
+            assert np.all(value >= low - 1e-9)
+            slack = np.where(y > 0, high - value, value - low)
+            assert np.abs(y * slack).max() < 1e-7  # complementarity
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"H": np.array([[np.nan]])},
+        {"g": np.array([np.inf])},
+        {"lower": np.array([1.0]), "upper": np.array([0.0])},
+        {"lower": np.array([np.nan])},
+    ],
+)
+def test_qp_refuses_what_would_stall_the_solver(broken):
+    data = {"H": np.eye(1), "g": np.ones(1), "lower": -np.ones(1), "upper": np.ones(1)} | broken
+    assert not QuadraticProgram(1, 0).solve(**data).solved
+
+
+def test_contradictory_rows_end_quickly_and_unsolved():
+    rows = np.array([[1.0, 1.0], [1.0, 1.0]])
+    solution = QuadraticProgram(2, 2).solve(
+        np.eye(2), np.zeros(2), -np.ones(2), np.ones(2), rows, np.array([1.0, -2.0]), np.array([1.5, -1.0])
+    )
+    assert not solution.solved
+    assert solution.iterations <= 60 * 60
