@@ -32,9 +32,9 @@ class ST1A(Exciter):
             +----------------------------------------------------------------------------------------------------------+
 
     At (2) and (3) stand a high-value gate with ``v_uel`` and then a low-value gate with ``v_oel``. Figure 12 has the overexcitation
-    limiter at the output only; its other positions are those of ST1C in the 2016 edition. A position other than 0 wants a limiter in
-    the unit: without one a gate never acts, and a sum is far off. The limits of the regulator do not wind up, those of the rectifier
-    do. A time constant of zero takes its block out.
+    limiter at the output only; its other positions are those of ST1C in the 2016 edition. A position other than 0 wants a limiter
+    in the unit: without one a gate never acts, and a sum is far off. The limits of the regulator do not wind up, those of the
+    rectifier do. A time constant of zero takes its block out.
 
     Defaults: Kundur's thyristor exciter; the limits of the error and of the regulator are out of reach.
 

@@ -12,7 +12,10 @@ import casadi as ca
 from pgexcite.core.declare import Expr
 
 Curve = Literal["none", "quadratic", "exponential"]
-"""How ``S(1.0)`` and ``S(1.2)`` are joined: not at all, ``B (E - A)^2 / E`` above ``A`` (PSS/E), or ``S(1.0) E^n``."""
+"""How ``S(1.0)`` and ``S(1.2)`` are joined: not at all, ``B (E - A)^2 / E`` above ``A`` (PSS/E), or ``S(1.0) E^n``.
+
+PSS/E drops saturation where ``S(1.0) = 0``: that is ``"none"`` here, for ``"quadratic"`` would start at ``A = 1``.
+"""
 
 _UPPER = 1.2
 """The voltage of the second point of a saturation curve, pu; the first is at 1."""
