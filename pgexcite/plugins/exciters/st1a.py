@@ -60,7 +60,7 @@ class ST1A(Exciter):
     V_RMAX: float = par(6.4, "pu", "ceiling at rated terminal voltage")
     K_C: float = par(0.0, "pu", "rectifier regulation: ceiling lost per pu of field current", ge=0)
     K_F: float = par(0.0, "pu", "gain of the rate feedback", ge=0)
-    T_F: float = par(1.0, "s", "time constant of the rate feedback", ge=0)
+    T_F: float = par(0.0, "s", "time constant of the rate feedback", ge=0)
     K_LR: float = par(0.0, "pu", "gain of the field-current limiter; 0 switches it off", ge=0)
     I_LR: float = par(4.4, "pu", "field current the limiter starts at", ge=0)
     uel_position: Position = par(0, "-", "underexcitation limiter: 0 none, 1 summed, 2 gate at input, 3 gate at output")

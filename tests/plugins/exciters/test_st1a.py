@@ -35,7 +35,7 @@ def settled(exciter, **inputs):
     T_B=st.sampled_from([0.0, 10.0]), K_F=st.sampled_from([0.0, 0.03]), K_LR=st.sampled_from([0.0, 4.54]),
 )  # fmt: skip
 def test_guess_is_the_steady_state(e_fd, v_t, i_fd, T_A, T_B, K_F, K_LR):
-    exciter = ST1A(T_A=T_A, T_B=T_B, T_C=T_B / 10, K_F=K_F, K_LR=K_LR)
+    exciter = ST1A(T_A=T_A, T_B=T_B, T_C=T_B / 10, K_F=K_F, T_F=1.0, K_LR=K_LR)
     known = {"e_fd": e_fd, "v_t": v_t, "i_fd": i_fd}
     point = Bench(exciter, released=True)(at_rest(exciter, known))
     assert max(abs(item) for item in point.rhs.values()) < 1e-11
@@ -55,6 +55,7 @@ def test_guess_is_the_steady_state(e_fd, v_t, i_fd, T_A, T_B, K_F, K_LR):
             "T_B1": 0.1,
             "T_C1": 0.3,
             "K_F": 0.03,
+            "T_F": 1.0,
             "K_C": 0.04,
             "K_LR": 4.54,
             "I_LR": 1.0,
