@@ -39,7 +39,7 @@ QUANTITIES = (
     Quantity("Reactive power Q [pu of the machine]", (("q_e", "Q"),)),
 )
 DIAGNOSTICS = {"cost": "cost [-]", "solve_ms": "solve time [ms]"}
-"""Controller signals with a plot in the overview, where the trace has them."""
+"""Controller signals with a plot in the overview, by the end of their name."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Overview:
         return [
             recording.plot(f"Controllers: {title}", [entity(path) for path in paths])
             for name, title in DIAGNOSTICS.items()
-            if (paths := [path for path in found if path.endswith(f".{name}")])
+            if (paths := [path for path in found if path.endswith(name)])
         ]
 
     def _component_plots(self) -> list[Any]:

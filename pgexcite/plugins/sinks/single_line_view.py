@@ -19,6 +19,10 @@ _WIRE: Colour = (150, 160, 170)
 _OPEN: Colour = (70, 72, 76)
 _NOTE: Colour = (205, 212, 220)
 
+_ROOM_FOR_FLOWS = 15
+_ROOM_FOR_NAMES = 40
+"""In grids of more buses than this labels would cover one another; the viewer then shows one on hovering."""
+
 VOLTAGE_COLOURS = (
     (0.00, (150, 60, 230)),
     (0.50, (70, 90, 255)),
@@ -59,6 +63,10 @@ class SingleLineView:
         """Buses whose voltage is in the trace."""
         return tuple(bus for bus in self.diagram.buses if f"bus.{bus}.v" in self.signals)
 
+    @property
+    def _names(self) -> bool:
+        return len(self.system.buses) <= _ROOM_FOR_NAMES
+
     def share(self) -> float:
         """Height of the view for the width it has, against 1 for a square one."""
         (left, right), (top, bottom) = self.diagram.bounds()
@@ -98,7 +106,7 @@ class SingleLineView:
         at = [drawing.anchors[path] for path in names]
         stream.log(
             f"{ROOT}/devices",
-            rr.Points2D(at, labels=[*names.values()], colors=[_NOTE] * len(at), radii=[0.01] * len(at), show_labels=True),
+            rr.Points2D(at, labels=[*names.values()], colors=[_NOTE] * len(at), radii=[0.01] * len(at), show_labels=self._names),
             static=True,
         )
         bars = [drawing.buses[bus] for bus in self.buses]
@@ -106,13 +114,13 @@ class SingleLineView:
         ends = [drawing.anchors[bus] for bus in self.buses]
         stream.log(
             f"{ROOT}/voltages",
-            rr.Points2D.from_fields(positions=ends, radii=[0.01] * len(ends), show_labels=True),
+            rr.Points2D.from_fields(positions=ends, radii=[0.01] * len(ends), show_labels=self._names),
             static=True,
         )
         middles = [drawing.branches[path].mean(axis=0) - (0.0, 33.0) for path in self.branches]
         stream.log(
             f"{ROOT}/flows",
-            rr.Points2D.from_fields(positions=middles, colors=[_NOTE] * len(middles), radii=[0.01] * len(middles), show_labels=True),
+            rr.Points2D.from_fields(positions=middles, colors=[_NOTE] * len(middles), radii=[0.01] * len(middles), show_labels=len(bars) <= _ROOM_FOR_FLOWS),
             static=True,
         )
 
