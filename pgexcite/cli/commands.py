@@ -215,7 +215,7 @@ def compare(runs: tuple[Path, ...], out: Path | None, as_json: bool) -> None:
     if as_json:
         show.json({"rows": found.rows, "picture": str(found.picture), "recording": str(found.recording)})
     else:
-        show.table(found.rows)
+        show.side_by_side(found.rows)
         click.echo(f"picture:   {found.picture}")
         click.echo(f"recording: {found.recording}   (open it with: rerun {found.recording})")
 

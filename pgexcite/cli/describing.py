@@ -38,18 +38,21 @@ def _describe(role: str, name: str) -> dict[str, Any]:
         "distribution": owner.distribution,
         "description": inspect.getdoc(cls) or "",
         "source": getattr(cls, "source", ""),
-        "parameters": [_parameter(record) for record in describe_parameters(cls)] if issubclass(cls, BaseModel) else [],
+        "parameters": [_parameter(cls, record) for record in describe_parameters(cls)]
+        if issubclass(cls, BaseModel)
+        else [],
         "variables": _variables(cls) if issubclass(cls, Component) else [],
     }
 
 
-def _parameter(record: dict[str, Any]) -> dict[str, Any]:
+def _parameter(cls: type[BaseModel], record: dict[str, Any]) -> dict[str, Any]:
+    info = cls.model_fields[record["name"]]
     signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
     bounds = ", ".join(f"{signs[key]} {value:g}" for key, value in record["bounds"].items() if value is not None)
     return {
         "name": record["name"],
         "unit": record["unit"],
-        "default": "required" if record["required"] else record["default"],
+        "default": "required" if info.is_required() else info.get_default(call_default_factory=True),
         "bounds": bounds,
         "description": record["description"],
     }

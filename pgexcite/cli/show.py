@@ -34,8 +34,17 @@ def table(rows: Sequence[Mapping[str, Any]], rename: Mapping[str, str] | None = 
         grid.add_row(*(_cell(row.get(key)) for key in keys))
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
-        console.width = 160  # a pipe has no width; the default of 80 would break every line
+        console.width = 1000  # a pipe has no width; the default of 80 would break every line
     console.print(grid)
+
+
+def side_by_side(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print the figures of several runs, one run to a column."""
+    heads = [
+        f"{row['label']} {row['unit']}" if len({r["unit"] for r in rows}) > 1 else str(row["label"]) for row in rows
+    ]
+    keys = [key for key in dict.fromkeys(key for row in rows for key in row) if key != "label"]
+    table([{"": key, **dict(zip(heads, (row.get(key) for row in rows), strict=True))} for key in keys])
 
 
 def summary(title: str, message: str, figures: Mapping[str, Any], directory: Path) -> None:

@@ -20,9 +20,6 @@ EVENTS: dict[str, type[BaseModel]] = {
 }
 """Class of every type of event."""
 
-_FROM_REGISTRY = {"backend": "mpc_backend", "estimator": "estimator"}
-"""Fields of a controller that name another registered model, and the role it must have."""
-
 
 @dataclass(frozen=True)
 class Grid:
@@ -95,7 +92,7 @@ def check_event(event: BaseModel, where: str, grid: Grid, collect: Collector) ->
 
 
 def check_controller(controller: BaseModel, where: str, grid: Grid, h: float | None, collect: Collector) -> None:
-    """A controller's sample time fits the step, and the unit and models it names exist."""
+    """A controller's sample time fits the step, and the unit it names exists."""
     dt = getattr(controller, "dt", None)
     if isinstance(dt, float) and h is not None:
         ratio = dt / h
@@ -109,9 +106,6 @@ def check_controller(controller: BaseModel, where: str, grid: Grid, h: float | N
             )
     if isinstance(unit := getattr(controller, "unit", None), str):
         collect.known("unit", unit, grid.names["unit"], f"{where}.unit")
-    for field, role in _FROM_REGISTRY.items():
-        if isinstance(name := getattr(controller, field, None), str):
-            collect.find(role, name, f"{where}.{field}")
 
 
 def adjustable(system: System) -> dict[str, tuple[BaseModel, str] | None]:
