@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,14 +28,6 @@ class PlainMachine(Machine):
 
 class PlainSource(Source):
     """A source without equations."""
-
-
-@dataclass(frozen=True)
-class Plant:
-    """A one-machine grid and the swing of its machine behind a fault."""
-
-    system: System
-    f_n: float = 50.0
 
 
 @pytest.fixture(scope="session")
@@ -70,7 +62,11 @@ def synthetic_run(plain_system: System) -> Callable[..., RunResult]:
         if mpc:
             n = len(trace.t)
             cost = np.cumsum(np.abs(trace["unit.G2.v_t"] - 1.0)) * 1e-2
-            columns = {**trace.columns, "controller.mpc.cost": cost, "controller.mpc.solve_ms": 1.0 + np.sin(np.arange(n)) ** 2}
+            columns = {
+                **trace.columns,
+                "controller.mpc.cost": cost,
+                "controller.mpc.solve_ms": 1.0 + np.sin(np.arange(n)) ** 2,
+            }
             units = {**trace.units, "controller.mpc.cost": "-", "controller.mpc.solve_ms": "ms"}
             trace = replace(trace, columns=columns, units=units)
             statistics["mpc"] = ControllerStatistics(samples=100, solve_ms=(1.0, 2.0, 9.0), fallbacks=1, cost=8.1)
@@ -85,7 +81,7 @@ def synthetic_run(plain_system: System) -> Callable[..., RunResult]:
 
 def _swing(system: System, gain: float, clearing: float, t_end: float) -> Trace:
     h, fault_at = 0.005, 0.5
-    x_d, x_q, xp_d, x_t, x_l, e_fd0, v_inf, p_m = 1.24, 0.70, 0.35, 0.12, 0.1501, 1.9246, 0.893, 0.86
+    x_q, xp_d, x_t, x_l, e_fd0, v_inf, p_m = 0.70, 0.35, 0.12, 0.1501, 1.9246, 0.893, 0.86
     v0 = 1.0
     i0 = np.conj((0.86 + 0.51j) / v0)
     behind = np.angle(v0 + 1j * x_q * i0)
@@ -131,9 +127,10 @@ def _swing(system: System, gain: float, clearing: float, t_end: float) -> Trace:
             v, _hv, i = network(state[0], faulted)
             p_e = (v * np.conj(i)).real
             target = np.clip(e_fd0 + gain * (1.0 - abs(v)), -3.2, 3.2) if gain else e_fd0
-            slope = np.array([2 * np.pi * 50 * (state[1] - 1), (p_m - p_e - 8.0 * (state[1] - 1)) / 5.8, (target - state[2]) / 0.02])
+            slope = np.array(
+                [2 * np.pi * 50 * (state[1] - 1), (p_m - p_e - 8.0 * (state[1] - 1)) / 5.8, (target - state[2]) / 0.02]
+            )
             state = state + h / 5 * slope
-            state[1] += h / 5 * (p_m - p_e) / 5.8 * 0.0
         keep((k + 1) * h, faulted)
         if state[0] > 1.2 * np.pi:
             break

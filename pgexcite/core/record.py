@@ -121,8 +121,8 @@ def write_summary(result: RunResult, path: Path) -> None:
 def write_trace(result: RunResult, path: Path) -> None:
     """Write a run's samples as Parquet: one column per signal, its unit in the field's metadata ``unit``, time in column ``t``.
 
-    The schema's metadata holds ``title``, ``outcome``, ``log``, ``config``, ``steps`` and ``wall_time`` as JSON. Floats are split by
-    bytes before zstd, which packs smooth curves about half again as well as plain zstd.
+    The schema's metadata holds ``title``, ``outcome``, ``log``, ``config``, ``steps`` and ``wall_time`` as JSON. Floats are split
+    by bytes before zstd, which packs smooth curves better than zstd alone.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

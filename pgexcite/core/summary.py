@@ -29,7 +29,8 @@ def summarise(result: RunResult) -> dict[str, Any]:
     - ``omega_max``: largest speed, pu; ``e_fd_max``, ``i_fd_max``: largest field voltage and current, pu (air-gap-line base);
     - ``settled_at``: see `settled_at`.
 
-    Of each controller: ``samples``, ``solve_ms`` (``median``, ``p99``, ``max``; ``None`` when it never solved), ``fallbacks``, ``cost``.
+    Of each controller: ``samples``, ``solve_ms`` (``median``, ``p99``, ``max``; ``None`` when it never solved), ``fallbacks``,
+    ``cost``.
     """
     return {
         "outcome": result.outcome.ending.value,

@@ -31,9 +31,9 @@ class Comparison:
     """A finished comparison.
 
     Attributes:
-        rows: one per run and unit: ``label``, ``unit``, ``outcome``, the unit's figures of ``summary.json``, and ``first_swing_deg``,
-            ``recovery_5`` and ``recovery_1`` [s after the last event], ``damping`` (of the swing), and over all controllers of the run
-            ``fallbacks`` and the largest ``solve_ms_p99``.
+        rows: one per run and unit: ``label``, ``unit``, ``outcome``, ``t_end``, the unit's figures of ``summary.json``, then
+            ``first_swing_deg``, ``recovery_5`` and ``recovery_1`` [s after the last event], ``damping`` (of the swing), and over
+            all controllers of the run ``fallbacks`` and the largest ``solve_ms_p99``.
         picture: the PNG.
         recording: the ``.rrd``.
     """
@@ -81,7 +81,12 @@ def overlay(runs: Mapping[str, Trace], units: Sequence[str], path: Path, title: 
                     where = _entity(label, unit, signal)
                     curves.setdefault((unit, signal), []).append((where, f"{label} {symbol}", colour(k)))
     stream = recording.new_stream(title, [*runs, *(f"{unit}.{signal}" for unit, signal in curves)])
-    titles = {"e_fd": "field voltage E_fd [pu]", "v_t": "terminal voltage V_t [pu]", "delta": "rotor angle δ [deg]", "omega": "rotor speed ω [pu]"}
+    titles = {
+        "e_fd": "field voltage E_fd [pu]",
+        "v_t": "terminal voltage V_t [pu]",
+        "delta": "rotor angle δ [deg]",
+        "omega": "rotor speed ω [pu]",
+    }
     columns = [
         rrb.Vertical(
             *(
@@ -135,7 +140,9 @@ def _common_units(runs: Mapping[str, Trace]) -> list[str]:
     first, *others = [unit_names(trace) for trace in runs.values()]
     units = [unit for unit in first if all(unit in names for names in others)]
     if not units:
-        raise CompareError(f"the runs have no unit in common; theirs are {', '.join(str(unit_names(t)) for t in runs.values())}")
+        raise CompareError(
+            f"the runs have no unit in common; theirs are {', '.join(str(unit_names(t)) for t in runs.values())}"
+        )
     return units
 
 

@@ -5,24 +5,17 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pgexcite.core import powerflow
-from pgexcite.core.errors import PgexciteError
 from pgexcite.core.events import Change
 from pgexcite.core.system import Device, System
 from pgexcite.studies.power_angle import Curve, EqualArea
+from pgexcite.studies.reduction import TABLES, EqualAreaError, source_impedance, transfer, with_changes
 
 _SAME_INSTANT = 1e-6
-
-
-class EqualAreaError(PgexciteError):
-    """The equal-area construction does not apply to this scenario."""
 
 
 class Case(Protocol):
@@ -111,7 +104,11 @@ class EqualAreaStudy:
             ("largest angle then", found["delta_max_deg"], "deg", "synchronism is lost"),
         )
         return [
-            {"quantity": name, "value": otherwise if value is None else f"{value:.4f}", "unit": "" if value is None else unit}
+            {
+                "quantity": name,
+                "value": otherwise if value is None else f"{value:.4f}",
+                "unit": "" if value is None else unit,
+            }
             for name, value, unit, otherwise in table
         ]
 
@@ -140,22 +137,28 @@ def equal_area(scenario: Case) -> EqualAreaStudy:
     machine = unit.components["machine"]
     for name in ("H", "Xp_d"):
         if getattr(machine, name, None) is None:
-            raise EqualAreaError(f"{unit.path}.machine: {type(machine).__name__} has no {name}; the construction needs it")
+            raise EqualAreaError(
+                f"{unit.path}.machine: {type(machine).__name__} has no {name}; the construction needs it"
+            )
     scale = unit.S_n / system.S_base
     v = flow.v[unit.bus]
     current = (flow.s[unit.path] / v).conjugate() / scale
-    source = _impedance(infinite, system)
+    source = source_impedance(infinite, system)
     e_infinite = flow.v[infinite.bus] + source * (flow.s[infinite.path] / flow.v[infinite.bus]).conjugate()
     z = complex(getattr(machine, "R_a", 0.0), machine.Xp_d)  # type: ignore[attr-defined]
     e = v + z * current
     on_q = v + complex(z.real, getattr(machine, "X_q", z.imag)) * current
     delta_0 = cmath.phase(e / e_infinite)
-    loads = {d.path: -flow.s[d.path].conjugate() / abs(flow.v[d.bus]) ** 2 for d in system.devices if d not in (unit, infinite)}
+    loads = {
+        d.path: -flow.s[d.path].conjugate() / abs(flow.v[d.bus]) ** 2
+        for d in system.devices
+        if d not in (unit, infinite)
+    }
 
     def curve(values: Mapping[str, float]) -> Curve:
-        own, transfer = _reduce(_changed(system, values), loads, (unit, z / scale), (infinite, source))
-        peak = abs(e * e_infinite * transfer) / scale
-        return Curve(peak, abs(e) ** 2 * own.real / scale, -cmath.phase(complex(transfer.imag, transfer.real)))
+        own, mutual = transfer(with_changes(system, values), loads, (unit, z / scale), (infinite, source))
+        peak = abs(e * e_infinite * mutual) / scale
+        return Curve(peak, abs(e) ** 2 * own.real / scale, -cmath.phase(complex(mutual.imag, mutual.real)))
 
     before = curve({})
     during = curve(_values(at_fault))
@@ -176,7 +179,8 @@ def equal_area(scenario: Case) -> EqualAreaStudy:
 
 def _pair(system: System) -> tuple[Device, Device]:
     """The one machine and the one infinite bus (a classical machine with H = 0 is one)."""
-    units, infinite = [], []
+    units: list[Device] = []
+    infinite: list[Device] = []
     for device in system.devices:
         if device.path.startswith("unit."):
             still = getattr(device.components["machine"], "H", None) == 0
@@ -198,7 +202,9 @@ def _stages(changes: Sequence[Change]) -> tuple[tuple[Change, ...], tuple[Change
     begins = [c.t for c in ordered if any(p.endswith(".fault_status") and v > 0 for p, v in c.values.items())]
     ends = [c.t for c in ordered if any(p.endswith(".fault_status") and v == 0 for p, v in c.values.items())]
     if len(begins) != 1:
-        raise EqualAreaError(f"the equal-area construction needs one fault; this scenario has {len(begins)} (event type 'fault')")
+        raise EqualAreaError(
+            f"the equal-area construction needs one fault; this scenario has {len(begins)} (event type 'fault')"
+        )
     t_on, t_off = begins[0], (ends[0] if ends else None)
     at_fault = tuple(c for c in ordered if abs(c.t - t_on) < _SAME_INSTANT)
     if t_off is None:
@@ -216,70 +222,11 @@ def _stages(changes: Sequence[Change]) -> tuple[tuple[Change, ...], tuple[Change
 def _values(changes: Sequence[Change]) -> dict[str, float]:
     merged: dict[str, float] = {}
     for change in changes:
-        foreign = [p for p in (*change.values, *(change.increments or {})) if p.split(".")[0] not in _TABLES]
+        foreign = [p for p in (*change.values, *(change.increments or {})) if p.split(".")[0] not in TABLES]
         if foreign:
             raise EqualAreaError(f"{foreign[0]} changes with the fault ({change.text}); only the network may")
         merged.update(change.values)
     return merged
-
-
-_TABLES = {"bus": "buses", "line": "lines", "transformer": "transformers", "shunt": "shunts"}
-
-
-def _changed(system: System, values: Mapping[str, float]) -> System:
-    """The system with parameters of its network replaced."""
-    tables: dict[str, dict[str, Any]] = {}
-    for path, value in values.items():
-        kind, name, parameter = path.split(".", 2)
-        table = tables.setdefault(_TABLES[kind], dict(getattr(system, _TABLES[kind])))
-        table[name] = table[name].model_copy(update={parameter: value})
-    return replace(system, **tables)  # type: ignore[arg-type]
-
-
-def _impedance(infinite: Device, system: System) -> complex:
-    """Impedance behind which an infinite bus holds its voltage, pu of the system base."""
-    if "machine" in infinite.components:
-        machine = infinite.components["machine"]
-        base = system.S_base / infinite.S_n
-        return complex(getattr(machine, "R_a", 0.0), getattr(machine, "Xp_d", 0.0)) * base
-    source = next(iter(infinite.components.values()))
-    return complex(getattr(source, "R", 0.0), getattr(source, "X", 0.0))
-
-
-def _reduce(
-    system: System, loads: Mapping[str, complex], machine: tuple[Device, complex], infinite: tuple[Device, complex]
-) -> tuple[complex, complex]:
-    """Driving-point and transfer admittance between the two internal voltages, pu of the system base (Kron reduction)."""
-    names = list(system.buses)
-    n = len(names)
-    y: NDArray[np.complex128] = np.zeros((n + 2, n + 2), dtype=complex)
-    y[:n, :n] = powerflow.admittance_matrix(system).toarray()
-    for device in system.devices:
-        if device.path in loads:
-            y[names.index(device.bus), names.index(device.bus)] += loads[device.path]
-    outer = []
-    for node, (device, z) in ((n, machine), (n + 1, infinite)):
-        k = names.index(device.bus)
-        outer.append(node if z != 0 else k)  # an ideal source is the voltage of its bus
-        if z != 0:
-            y[[k, node], [k, node]] += 1.0 / z
-            y[[k, node], [node, k]] -= 1.0 / z
-    earthed = []
-    for k, (name, bus) in enumerate(system.buses.items()):
-        z = complex(bus.fault_R, bus.fault_X)
-        if bus.fault_status > 0 and z == 0:
-            if k in outer:
-                raise EqualAreaError(f"bus.{name}: a bolted fault at an ideal source has no solution; give the fault an impedance")
-            earthed.append(k)
-        elif bus.fault_status > 0:
-            y[k, k] += 1.0 / z
-    inner = [k for k in range(n) if k not in earthed and k not in outer]
-    try:
-        passed_on = np.linalg.solve(y[np.ix_(inner, inner)], y[np.ix_(inner, outer)])
-    except np.linalg.LinAlgError as error:
-        raise EqualAreaError("a bus is cut off from everything else after the fault; the network cannot be reduced") from error
-    reduced = y[np.ix_(outer, outer)] - y[np.ix_(outer, inner)] @ passed_on
-    return complex(reduced[0, 0]), complex(reduced[0, 1])
 
 
 def _degrees(angle: float | None) -> float | None:

@@ -74,7 +74,14 @@ def draw_runs(
                     continue
                 values = np.degrees(samples) if signal == "delta" else samples
                 name = label if len(units) == 1 else f"{label}: {unit}"
-                ax.plot(trace.t, values, color=COLOURS[k % len(COLOURS)], linestyle=dashes[j % len(dashes)], linewidth=1.5, label=name)
+                ax.plot(
+                    trace.t,
+                    values,
+                    color=COLOURS[k % len(COLOURS)],
+                    linestyle=dashes[j % len(dashes)],
+                    linewidth=1.5,
+                    label=name,
+                )
         ax.set_ylabel(axis_label, color=_INK)
         ax.margins(x=0.0, y=0.08)
     if window:

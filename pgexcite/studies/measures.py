@@ -12,7 +12,7 @@ from pgexcite.core.trace import Array, Trace
 
 _SMALLEST_SWING = math.radians(0.1)
 """Turning points with less swing between them than this are noise, rad."""
-_FADED = 0.02
+_FADED = 0.1
 """A swing below this part of the first one is no longer measured: the ratio of two small numbers says little."""
 
 
@@ -40,7 +40,7 @@ def recovery_time(trace: Trace, unit: str, band: float) -> float | None:
 def swing_damping(trace: Trace, unit: str) -> float | None:
     """Damping ratio of the rotor's swing behind the last event, from its logarithmic decrement.
 
-    The ratio of neighbouring swings (crest to trough, trough to crest) is averaged over all that are larger than 2 % of the first;
+    The ratio of neighbouring swings (crest to trough, trough to crest) is averaged over all that are larger than 10 % of the first;
     differences between turning points do not care about a drifting mean. ``None`` with fewer than three turning points.
     """
     events = event_times(trace)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -141,7 +142,7 @@ class EqualArea:
 
         return None if left(limit) >= 0 else float(brentq(left, delta, limit, xtol=1e-13))
 
-    def _swing(self, curve: Curve, delta: float, speed: float, t_end: float, event: object = None) -> object:
+    def _swing(self, curve: Curve, delta: float, speed: float, t_end: float, event: Any = None) -> Any:
         def slope(_t: float, y: np.ndarray) -> tuple[float, float]:
             return y[1], math.pi * self.f_n / self.H * (self.p_m - curve(y[0]))
 

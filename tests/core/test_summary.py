@@ -11,7 +11,10 @@ from pgexcite.core.trace import LogEntry, Trace
 
 def trace_of(t, v_t, events=(), **columns):
     log = [LogEntry(at, "event", "something happens") for at in events]
-    columns = {"unit.G.v_t": np.asarray(v_t, float), **{f"unit.G.{k}": np.asarray(v, float) for k, v in columns.items()}}
+    columns = {
+        "unit.G.v_t": np.asarray(v_t, float),
+        **{f"unit.G.{k}": np.asarray(v, float) for k, v in columns.items()},
+    }
     return Trace(np.asarray(t, float), columns, {}, log)
 
 

@@ -68,8 +68,8 @@ class Capability:
     def under_excitation(self) -> Points:
         """Practical stability limit, ``(n, 2)`` of (P, Q): 0.1 pu of power kept in hand at each excitation.
 
-        At constant excitation E the power ``V E sin(d)/X_d + V^2/2 (1/X_q - 1/X_d) sin(2d)`` peaks at an angle d_m; the limit is the
-        point of the same E that lies 0.1 pu below the peak.
+        At constant excitation E the power ``V E sin(d)/X_d + V^2/2 (1/X_q - 1/X_d) sin(2d)`` peaks at an angle d_m; the limit is
+        the point of the same E that lies 0.1 pu below the peak.
         """
         if self.X_d is None or self.X_q is None:
             return np.empty((0, 2))

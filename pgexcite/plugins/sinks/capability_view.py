@@ -83,12 +83,18 @@ class CapabilityView:
     def _axes(self, stream: Any, root: str) -> None:
         import rerun as rr
 
-        ticks = [v for v in (-1.0, -0.5, 0.5, 1.0)]
-        lines = [[(-40, 0), (125, 0)], [(0, -115), (0, 115)]]
+        ticks = (-1.0, -0.5, 0.5, 1.0)
+        lines = [[(-40.0, 0.0), (125.0, 0.0)], [(0.0, -115.0), (0.0, 115.0)]]
         lines += [[(SCALE * v, -1.5), (SCALE * v, 1.5)] for v in ticks if v > 0]
         lines += [[(-1.5, -SCALE * v), (1.5, -SCALE * v)] for v in ticks]
-        stream.log(f"{root}/axes", rr.LineStrips2D(lines, colors=[_AXIS] * len(lines), radii=[0.3] * len(lines)), static=True)
-        at = [(SCALE * v, 3) for v in ticks if v > 0] + [(-9, -SCALE * v - 2) for v in ticks] + [(128, -3), (0, -119)]
+        stream.log(
+            f"{root}/axes", rr.LineStrips2D(lines, colors=[_AXIS] * len(lines), radii=[0.3] * len(lines)), static=True
+        )
+        at = (
+            [(SCALE * v, 3.0) for v in ticks if v > 0]
+            + [(-9.0, -SCALE * v - 2) for v in ticks]
+            + [(128.0, -3.0), (0.0, -119.0)]
+        )
         text = [f"{v:g}" for v in ticks if v > 0] + [f"{v:g}" for v in ticks] + ["P", "Q"]
         recording_labels(stream, f"{root}/ticks", at, text, _AXIS)
 
@@ -113,16 +119,22 @@ class CapabilityView:
             if entity(device.path, ROOT) == root:
                 point = rr.Points2D.from_fields(colors=[colour(k)], radii=[2.6], draw_order=40.0)
                 stream.log(f"{root}/point", point, static=True)
-                reading = rr.Points2D.from_fields(positions=[(112, -112)], colors=[colour(k)], radii=[0.01], show_labels=True)
+                reading = rr.Points2D.from_fields(
+                    positions=[(112, -112)], colors=[colour(k)], radii=[0.01], show_labels=True
+                )
                 stream.log(f"{root}/reading", reading, static=True)
 
 
-def recording_labels(stream: Any, path: str, at: list[tuple[float, float]], text: list[str], rgb: recording.Colour) -> None:
+def recording_labels(
+    stream: Any, path: str, at: list[tuple[float, float]], text: list[str], rgb: recording.Colour
+) -> None:
     """Text at points, the points themselves invisible."""
     import rerun as rr
 
     stream.log(
-        path, rr.Points2D(at, labels=text, colors=[rgb] * len(at), radii=[0.01] * len(at), show_labels=True), static=True
+        path,
+        rr.Points2D(at, labels=text, colors=[rgb] * len(at), radii=[0.01] * len(at), show_labels=True),
+        static=True,
     )
 
 

@@ -43,7 +43,11 @@ class Diagram:
 
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Ranges of x and y that hold everything, with a margin for labels."""
-        lines = [*self.buses.values(), *self.branches.values(), *(line for item in self.symbols.values() for line in item)]
+        lines = [
+            *self.buses.values(),
+            *self.branches.values(),
+            *(line for item in self.symbols.values() for line in item),
+        ]
         points = np.vstack(lines)
         low, high = points.min(axis=0) - 45.0, points.max(axis=0) + 45.0
         return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
@@ -102,7 +106,8 @@ def _apart(position: Points) -> Points:
     gap = np.linalg.norm(position[:, None] - position[None], axis=2) + np.eye(len(position))
     twin = np.min(gap, axis=1) < 0.1 if len(position) > 1 else np.zeros(len(position), dtype=bool)
     turn = 2.399963 * np.arange(len(position))  # the golden angle: no two in one direction
-    return position + 0.2 * twin[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    moved: Points = position + 0.2 * twin[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    return moved
 
 
 def _upright(system: System, position: Points, index: dict[str, int]) -> Points:

@@ -91,7 +91,9 @@ class SingleLineView:
         drawing = self.diagram
         wires = list(drawing.branches.values())
         stream.log(f"{ROOT}/branches", _strips(wires, _WIRE, 0.7), static=True)
-        units = {device.path: k for k, device in enumerate(d for d in self.system.devices if d.path.startswith("unit."))}
+        units = {
+            device.path: k for k, device in enumerate(d for d in self.system.devices if d.path.startswith("unit."))
+        }
         for kind in ("unit", "load", "other"):
             lines, colours = [], []
             for path, symbol in drawing.symbols.items():
@@ -106,11 +108,17 @@ class SingleLineView:
         at = [drawing.anchors[path] for path in names]
         stream.log(
             f"{ROOT}/devices",
-            rr.Points2D(at, labels=[*names.values()], colors=[_NOTE] * len(at), radii=[0.01] * len(at), show_labels=self._names),
+            rr.Points2D(
+                at, labels=[*names.values()], colors=[_NOTE] * len(at), radii=[0.01] * len(at), show_labels=self._names
+            ),
             static=True,
         )
         bars = [drawing.buses[bus] for bus in self.buses]
-        stream.log(f"{ROOT}/buses", rr.LineStrips2D.from_fields(strips=bars, radii=[2.4] * len(bars), draw_order=30.0), static=True)
+        stream.log(
+            f"{ROOT}/buses",
+            rr.LineStrips2D.from_fields(strips=bars, radii=[2.4] * len(bars), draw_order=30.0),
+            static=True,
+        )
         ends = [drawing.anchors[bus] for bus in self.buses]
         stream.log(
             f"{ROOT}/voltages",
@@ -120,7 +128,12 @@ class SingleLineView:
         middles = [drawing.branches[path].mean(axis=0) - (0.0, 33.0) for path in self.branches]
         stream.log(
             f"{ROOT}/flows",
-            rr.Points2D.from_fields(positions=middles, colors=[_NOTE] * len(middles), radii=[0.01] * len(middles), show_labels=len(bars) <= _ROOM_FOR_FLOWS),
+            rr.Points2D.from_fields(
+                positions=middles,
+                colors=[_NOTE] * len(middles),
+                radii=[0.01] * len(middles),
+                show_labels=len(bars) <= _ROOM_FOR_FLOWS,
+            ),
             static=True,
         )
 
@@ -140,7 +153,11 @@ class SingleLineView:
             )
         if self.branches:
             flows = [(trace[f"{path}.p_from"][shown], trace[f"{path}.q_from"][shown]) for path in self.branches]
-            text = [self._flow(path, p[k], q[k]) for k in range(len(shown)) for path, (p, q) in zip(self.branches, flows, strict=True)]
+            text = [
+                self._flow(path, p[k], q[k])
+                for k in range(len(shown))
+                for path, (p, q) in zip(self.branches, flows, strict=True)
+            ]
             sizes = [len(self.branches)] * len(shown)
             stream.send_columns(f"{ROOT}/flows", index, rr.Points2D.columns(labels=text).partition(sizes))
 

@@ -1,13 +1,23 @@
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
 
+from pgexcite.core.config import from_data, load
+from pgexcite.core.record import read_trace, write_record
 from pgexcite.core.recording import entity
+from pgexcite.core.simulate import Simulation
 from pgexcite.core.trace import Trace
+from pgexcite.plugins.sinks.config import ConfigSink
 from pgexcite.plugins.sinks.overview import frames
+from pgexcite.plugins.sinks.parquet import ParquetSink
 from pgexcite.plugins.sinks.rerun import RerunSink, serve
+from pgexcite.plugins.sinks.summary import SummarySink
+
+ST1A = Path(__file__).parents[3] / "configs" / "smib" / "fault_st1a.toml"
 
 
 def read_back(path):
@@ -31,6 +41,28 @@ def test_the_recording_holds_the_trace(synthetic_run, tmp_path):
         np.testing.assert_array_equal(values, samples)
         np.testing.assert_array_equal(step, np.arange(len(samples)))
         np.testing.assert_allclose(time, result.trace.t, rtol=0, atol=1e-9)  # rerun's clock counts nanoseconds
+
+
+def test_the_recording_of_a_real_run_equals_its_parquet_file(tmp_path):
+    scenario = load(ST1A, ["simulation.t_end=2.0"])
+    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation.run()
+    result = simulation.result(scenario.title, scenario.resolved)
+    sinks = [ConfigSink(), ParquetSink(), SummarySink(), RerunSink()]
+    directory = write_record(result, tmp_path / "run", sinks)
+    assert sorted(path.name for path in directory.iterdir()) == [
+        "config.toml",
+        "run.rrd",
+        "summary.json",
+        "trace.parquet",
+    ]
+    trace, found = read_trace(directory), read_back(directory / "run.rrd")
+    assert len(trace.columns) > 20
+    for path, samples in trace.columns.items():
+        time, _, values = found[entity(path)]
+        np.testing.assert_array_equal(values, samples)
+        np.testing.assert_allclose(time, trace.t, rtol=0, atol=1e-9)
+    assert from_data(tomllib.loads((directory / "config.toml").read_text())).system == scenario.system
 
 
 def test_both_sides_of_an_event_share_one_time(synthetic_run, tmp_path):

@@ -38,7 +38,10 @@ def screenshots(recording: Path, directory: Path):
         port = probe.getsockname()[1]
     command = [viewer, recording, "--headless", "--window-size", f"{WIDTH}x{HEIGHT}", "--port", str(port)]
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(directory), "HOME": str(directory)}
-    with (directory / "viewer.log").open("w") as log, subprocess.Popen(command, stdout=log, stderr=log, env=environment) as process:
+    with (
+        (directory / "viewer.log").open("w") as log,
+        subprocess.Popen(command, stdout=log, stderr=log, env=environment) as process,
+    ):
         try:
             end = time.monotonic() + TIMEOUT
             while time.monotonic() < end and process.poll() is None:
@@ -50,7 +53,6 @@ def screenshots(recording: Path, directory: Path):
                     yield pixels(picture)
         finally:
             process.terminate()
-    print((directory / "viewer.log").read_text())
 
 
 def pixels(picture: Path):
@@ -73,7 +75,10 @@ def wait_for(recording, directory, wanted):
         counts = [count(image, *item) for item in wanted]
         if min(counts) >= FEW:
             return
-    pytest.fail(f"not all curves were drawn; pixels found: {counts}, at least {FEW} wanted of each")
+    log = (directory / "viewer.log").read_text()
+    pytest.fail(
+        f"not all curves were drawn; pixels found: {counts}, at least {FEW} wanted of each; the viewer says:\n{log}"
+    )
 
 
 def test_every_panel_of_a_run_shows_its_curve(synthetic_run, tmp_path):
@@ -84,12 +89,17 @@ def test_every_panel_of_a_run_shows_its_curve(synthetic_run, tmp_path):
     wanted = [(unit, column, rows[k]) for k in range(3) for column in (left, right)]
     wanted.append((current, right, rows[1]))
     wanted.append((unit, (0.0, 0.39), (0.06, 0.33)))  # the unit's symbol in the single-line diagram
-    wanted += [(rgb, (0.0, 0.39), (0.4, 0.95)) for rgb in ((90, 160, 255), (255, 150, 50), (235, 90, 105), (90, 210, 120))]
+    wanted += [
+        (rgb, (0.0, 0.39), (0.4, 0.95)) for rgb in ((90, 160, 255), (255, 150, 50), (235, 90, 105), (90, 210, 120))
+    ]
     wait_for(path, tmp_path, wanted)
 
 
 def test_an_overlay_shows_every_run(synthetic_run, tmp_path):
-    runs = {name: synthetic_run(gain=gain, clearing=c).trace for name, gain, c in (("a", 0, 0.06), ("b", 30, 0.1), ("c", 60, 0.15))}
+    runs = {
+        name: synthetic_run(gain=gain, clearing=c).trace
+        for name, gain, c in (("a", 0, 0.06), ("b", 30, 0.1), ("c", 60, 0.15))
+    }
     path = overlay(runs, ["G2"], tmp_path / "compare.rrd", "overlay test")
     rows = [(0.06 + 0.195 * k, 0.06 + 0.195 * (k + 1)) for k in range(4)]
     wait_for(path, tmp_path, [(PALETTE[k], (0.0, 0.9), row) for k in range(3) for row in rows])
