@@ -242,6 +242,13 @@ def test_a_snapshot_of_another_model_is_refused(tmp_path):
     assert not (tmp_path / "b").exists()
 
 
+def test_a_live_run_ends_without_a_viewer(tmp_path):
+    result = call("run", SMIB / "fault_st1a.toml", *SHORT, "--live", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    assert "live view: rerun rerun+http://127.0.0.1:" in result.stderr
+    assert (tmp_path / "out" / "summary.json").exists()
+
+
 def test_check_prints_the_operating_point():
     found = figures("check", SMIB / "fault_constant.toml")
     buses = {row["bus"]: row for row in found["buses"]}
