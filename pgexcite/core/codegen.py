@@ -147,9 +147,11 @@ int pgexcite_advance(int rule, double h, int n, int *startup, double *x, double 
 
 _ROLLOUT = r"""
 #define NU {n_u}
+#define NP {n_p}
 #define NC {n_commands}
 #define NK {n_columns}
 #define NS {n_selected}
+#define TRANSITION {transition}
 
 static double S[NW * NK], S_next[NW * NK], S_b[AT_LEAST_1(NX) * NK], S_c[NC * NK];
 
@@ -188,37 +190,57 @@ static void sense_step(Stage *s, int rule, int euler) {{
 }}
 
 static void sense_settling(Stage *s, const double *x, const double *z) {{
+    int i;
     memcpy(s->start, x, sizeof(double) * NX); memcpy(s->start + NX, z, sizeof(double) * NZ);
+    s->c = {frozen};
+    for (i = 0; i < NX; i++) s->b[i] = s->mass[i] * x[i];
     scale_by_mass(s, 1, S, 0, S);
     sense_stage(s, s->start, s->b, S);
 }}
 
-/* Rolls out N samples of count[j] steps of length h[j] under moves[in_force[j]]; outputs and their derivatives after each. Returns
-   how many samples were completed. */
-int pgexcite_rollout(int rule, int N, const int *count, const double *h, const int *in_force, const int *commands, int startup,
-                     double *x, double *z, double *d, double *u, const double *p, const double *moves, int derivatives,
-                     double *y, double *dy) {{
+/* Directions of the sensitivities at the start of a piece: the commands of its move; of a sample also, if transitions are wanted,
+   each state by itself. */
+static void point_at(int move, int fresh_sample) {{
+    int i;
+    if (TRANSITION && !fresh_sample) return;
+    memset(S_c, 0, sizeof S_c);
+    if (TRANSITION) {{
+        memset(S, 0, sizeof S);
+        for (i = 0; i < NX; i++) S[i * NW + i] = 1;
+        for (i = 0; i < NC; i++) S_c[(NX + i) * NC + i] = 1;
+    }} else {{
+        for (i = 0; i < NC; i++) S_c[(move * NC + i) * NC + i] = 1;
+    }}
+}}
+
+/* Rolls out N pieces of count[j] steps of length h[j] under moves[move[j]], parameters and other commands of row[j]; outputs and
+   derivatives after each piece that ends a sample. Returns how many pieces were completed. */
+int pgexcite_rollout(int rule, int N, const int *count, const double *h, const int *move, const int *row, const int *end,
+                     const int *commands, int startup, double *x, double *z, double *d, const double *p_rows,
+                     const double *u_rows, const double *moves, int derivatives, double *y, double *dy, double *dx) {{
     static Stage s;
-    int j, i, k;
-    s.d = d; s.u = u; s.p = p; s.c = 0;
+    static double u[AT_LEAST_1(NU)], u_last[AT_LEAST_1(NU)];
+    int j, i, k, sample = 0, fresh = 1;
+    memcpy(u_last, u_rows, sizeof(double) * NU);
+    s.d = d; s.u = u_last; s.p = p_rows; s.c = 0;
     history_at(&s, x, z);
     memset(S, 0, sizeof S); memset(S_c, 0, sizeof S_c);
     for (j = 0; j < N; j++) {{
-        if (j == 0 || in_force[j] != in_force[j - 1]) {{
-            int moved = 0;
-            memset(S_c, 0, sizeof S_c);
-            for (i = 0; i < NC; i++) {{
-                double value = moves[in_force[j] * NC + i];
-                moved |= u[commands[i]] != value;
-                u[commands[i]] = value;
-                S_c[(in_force[j] * NC + i) * NC + i] = 1;
-            }}
-            s.c = {frozen};
-            if (moved) {{
-                if (!settle(&s, x, z)) return j;
-                startup = {startup_steps};
-            }} else for (i = 0; i < NX; i++) s.b[i] = s.mass[i] * x[i];
-            if (derivatives) sense_settling(&s, x, z);
+        int changed = j > 0 && row[j] != row[j - 1];
+        memcpy(u, u_rows + (long)row[j] * NU, sizeof(double) * NU);
+        for (i = 0; i < NC; i++) u[commands[i]] = moves[move[j] * NC + i];
+        for (i = 0; i < NU; i++) changed |= u[i] != u_last[i];
+        s.u = u; s.p = p_rows + (long)row[j] * NP;
+        if (changed) {{
+            s.c = 0;
+            history_at(&s, x, z);
+            if (!settle(&s, x, z)) return j;
+            startup = {startup_steps};
+            memcpy(u_last, u, sizeof(double) * NU);
+        }}
+        if (derivatives && (fresh || changed)) {{
+            point_at(move[j], fresh);
+            sense_settling(&s, x, z);
         }}
         for (k = 0; k < count[j]; k++) {{
             int euler = rule == 1 && startup > 0;
@@ -230,11 +252,43 @@ int pgexcite_rollout(int rule, int N, const int *count, const double *h, const i
                 if (derivatives) sense_settling(&s, x, z);
             }}
         }}
-        args[0] = x; args[1] = z; args[2] = d; args[3] = u; args[4] = p; args[5] = S; args[6] = S_c;
-        results[0] = y + j * NS; results[1] = derivatives ? dy + (long)j * NS * NK : 0;
+        fresh = end[j];
+        if (!end[j]) continue;
+        args[0] = x; args[1] = z; args[2] = d; args[3] = u; args[4] = s.p; args[5] = S; args[6] = S_c;
+        results[0] = y + sample * NS; results[1] = derivatives ? dy + (long)sample * NS * NK : 0;
         output_sensitivity(args, results, iwork, work, 0);
+        if (derivatives && TRANSITION)
+            for (k = 0; k < NK; k++) memcpy(dx + ((long)sample * NK + k) * NX, S + k * NW, sizeof(double) * NX);
+        sample++;
     }}
     return N;
+}}
+
+/* Chains the transitions of N samples into derivatives to the initial states and to n_moves moves; move[j] is in force in sample j.
+   Q = NX + n_moves * NC columns; X holds Q * NX numbers, twice. */
+void pgexcite_condense(int N, int n_moves, const int *move, const double *dy, const double *dx, double *X, double *G) {{
+    int Q = NX + n_moves * NC, j, q, k, i;
+    double *next = X + (long)Q * NX;
+    memset(X, 0, sizeof(double) * 2 * Q * NX);
+    for (i = 0; i < NX; i++) X[i * NX + i] = 1;
+    for (j = 0; j < N; j++) {{
+        const double *Y = dy + (long)j * NS * NK, *A = dx + (long)j * NK * NX;
+        double *swap = X;
+        for (q = 0; q < Q; q++) {{
+            int own = q - NX - move[j] * NC;
+            double *g = G + ((long)j * Q + q) * NS, *to = next + (long)q * NX;
+            for (i = 0; i < NS; i++) g[i] = own >= 0 && own < NC ? Y[(NX + own) * NS + i] : 0;
+            for (i = 0; i < NX; i++) to[i] = own >= 0 && own < NC ? A[(NX + own) * NX + i] : 0;
+            if (q >= NX && q >= NX + (move[j] + 1) * NC) continue;
+            for (k = 0; k < NX; k++) {{
+                double v = X[(long)q * NX + k];
+                if (v == 0) continue;
+                for (i = 0; i < NS; i++) g[i] += Y[k * NS + i] * v;
+                for (i = 0; i < NX; i++) to[i] += A[k * NX + i] * v;
+            }}
+        }}
+        X = next; next = swap;
+    }}
 }}
 """
 

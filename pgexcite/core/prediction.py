@@ -27,20 +27,67 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Horizon:
+    """A horizon as consecutive pieces of equal steps; a sample is one piece, or several where something known happens inside it.
+
+    Attributes:
+        counts, lengths: number and length (s) of the steps of each piece, shape ``(n,)``.
+        moves: which move is in force in each piece.
+        rows: which row of ``p`` and ``u`` holds in each piece.
+        ends: 1 where a sample ends with the piece.
+        p: parameters, shape ``(n_rows, n_p)``.
+        u: commands; those that the moves set are overwritten, shape ``(n_rows, n_u)``.
+    """
+
+    counts: NDArray[np.int32]
+    lengths: Array
+    moves: NDArray[np.int32]
+    rows: NDArray[np.int32]
+    ends: NDArray[np.int32]
+    p: Array
+    u: Array
+
+    @staticmethod
+    def plain(count: int, h: float, moves: Sequence[int], state: State, p: Array) -> Horizon:
+        """Samples of ``count`` steps of ``h`` seconds with everything but the moves as it is; ``moves`` has one entry a sample."""
+        n = len(moves)
+        return Horizon(
+            np.full(n, count, dtype=np.int32),
+            np.full(n, h),
+            np.array(moves, dtype=np.int32),
+            np.zeros(n, dtype=np.int32),
+            np.ones(n, dtype=np.int32),
+            np.ascontiguousarray(p, dtype=float)[None],
+            np.array(state.u)[None],
+        )
+
+    @property
+    def sample_moves(self) -> NDArray[np.int32]:
+        """The move in force in each sample, shape ``(N,)``."""
+        return np.ascontiguousarray(self.moves[self.ends > 0])
+
+
+@dataclass(frozen=True)
 class Rollout:
     """A prediction.
 
     Attributes:
         y: selected outputs at the end of each sample, shape ``(N, n_y)``.
         dy: derivatives to the moves, shape ``(N, n_y, n_moves * n_u)``, the commands of one move together; or ``None``.
+        dx: derivatives to the initial states, shape ``(N, n_y, n_x)``; or ``None``.
     """
 
     y: Array
-    dy: Array | None
+    dy: Array | None = None
+    dx: Array | None = None
 
 
 class Predictor:
     """Rolls the kernel's step out under a sequence of moves.
+
+    Derivatives come in one of two ways: directly, a column for each move, or as a transition of each sample (columns for its states
+    and its commands) chained afterwards. Transitions also give derivatives to the initial states, and are cheaper where there are
+    more moves than states.
 
     Args:
         kernel: of the model that predicts; the predictor has it for itself.
@@ -48,6 +95,7 @@ class Predictor:
         outputs: positions in ``y`` of the outputs wanted.
         n_moves: number of moves.
         rule: integration rule. The prediction runs as C where the kernel does.
+        transitions: which way; ``None`` takes the cheaper one.
     """
 
     def __init__(
@@ -57,147 +105,157 @@ class Predictor:
         outputs: Sequence[int],
         n_moves: int,
         rule: Rule,
+        *,
+        transitions: bool | None = None,
     ) -> None:
         self._kernel, self._rule, self._n_moves = kernel, rule, n_moves
         self._commands, self._outputs = np.array(commands, dtype=np.int32), np.array(outputs, dtype=np.int32)
-        columns = n_moves * self._commands.size
+        n_x, n_u = kernel.x.size, len(commands)
+        self.transitions = n_x < (n_moves - 1) * n_u if transitions is None else transitions
+        columns = n_x + n_u if self.transitions else n_moves * n_u
         self._functions = _write_sensitivities(kernel, self._commands, self._outputs, columns)
-        self._compiled = self._compile(columns)
+        self._library = self._compile(columns)
         stage, history, output = self._functions
-        k, rows = kernel, (kernel.w.size, kernel.x.size, self._commands.size, self._outputs.size)
+        k, rows = kernel, (kernel.w.size, n_x, n_u, self._outputs.size)
         # CasADi keeps matrices column by column, so a row of these arrays is a column of the sensitivity.
         self._S, self._S_b, self._S_c, self._S_y = (np.zeros((columns, n)) for n in rows)
-        self._S_middle = np.zeros_like(self._S)
         self._S_new = np.zeros_like(self._S)
         given = [k.d, k.u, k.p]
         S, S_b, S_c, S_y, S_new = (a.reshape(-1) for a in (self._S, self._S_b, self._S_c, self._S_y, self._S_new))
-        self._x, self._z = np.zeros(k.x.size), np.zeros(k.z.size)
+        self._x, self._z = np.zeros(n_x), np.zeros(k.z.size)
         self._stage = bind(stage, [k.w, k.b, k.c, *given, S_b, S_c], [S_new])
         self._stage_middle = bind(stage, [k.middle, k.b_middle, k.c, *given, S_b, S_c], [S_new])
         self._history = bind(history, [self._x, self._z, *given, k.c, S, S_c], [S_b])
         self._y = np.zeros(self._outputs.size)
         self._output = bind(output, [k.x, k.z, *given, S, S_c], [self._y, S_y])
 
-    def _compile(self, columns: int) -> Any:
+    def _compile(self, columns: int) -> ctypes.CDLL | None:
         functions = self._kernel.functions
         if not self._kernel.compiled or functions.newton is None:
             return None
         sizes = {"n_commands": self._commands.size, "n_columns": columns, "n_selected": self._outputs.size}
         loop = [functions.newton, functions.history, functions.update, functions.outputs]
-        source = generate([*loop, *self._functions], self._kernel.constants() | sizes, rollout=True)
-        library = build(source)
-        return None if library is None else load(library).pgexcite_rollout
+        constants = self._kernel.constants() | sizes | {"transition": int(self.transitions)}
+        library = build(generate([*loop, *self._functions], constants, rollout=True))
+        return None if library is None else load(library)
 
-    def roll(
-        self,
-        state: State,
-        p: Array,
-        moves: Array,
-        counts: Sequence[int],
-        lengths: Sequence[float],
-        in_force: NDArray[np.intp],
-        *,
-        derivatives: bool,
-    ) -> Rollout | None:
+    def roll(self, state: State, moves: Array, horizon: Horizon, *, derivatives: bool) -> Rollout | None:
         """Predict.
 
         Args:
             state: where the prediction starts; its commands are those in force before the first move.
-            p: parameters over the horizon, shape ``(n_p,)``.
             moves: commands, shape ``(n_moves, n_u)``.
-            counts, lengths: number and length (s) of the steps in each of ``N`` samples.
-            in_force: which move is in force in each sample, shape ``(N,)``.
+            horizon: the pieces, and what is known of them.
             derivatives: whether to propagate sensitivities.
 
         Returns:
             The prediction, or ``None`` where the model cannot be stepped over the horizon.
         """
-        y = np.empty((len(counts), self._outputs.size))
-        dy = np.zeros((len(counts), self._S.shape[0], self._outputs.size)) if derivatives else np.zeros((0, 0, 0))
-        roll = self._roll if self._compiled is None else self._roll_compiled
-        if not roll(state, p, np.ascontiguousarray(moves, dtype=float), counts, lengths, in_force, y, dy):
+        N, (columns, n_x) = int(horizon.ends.sum()), (self._S.shape[0], self._x.size)
+        y = np.empty((N, self._outputs.size))
+        dy = np.zeros((N, columns, self._outputs.size)) if derivatives else np.zeros((0, 0, 0))
+        dx = np.zeros((N, columns, n_x)) if derivatives and self.transitions else np.zeros((0, 0, 0))
+        roll = self._roll if self._library is None else self._roll_compiled
+        if not roll(state, np.ascontiguousarray(moves, dtype=float), horizon, y, dy, dx):
             return None
         if not (np.isfinite(y).all() and np.isfinite(dy).all()):
             return None
-        return Rollout(y, dy.transpose(0, 2, 1) if derivatives else None)
+        if not derivatives:
+            return Rollout(y)
+        if not self.transitions:
+            return Rollout(y, dy.transpose(0, 2, 1))
+        chained = self._condense(horizon.sample_moves, dy, dx)
+        return Rollout(y, chained[:, :, n_x:], chained[:, :, :n_x])
 
-    def _roll_compiled(
-        self,
-        state: State,
-        p: Array,
-        moves: Array,
-        counts: Sequence[int],
-        lengths: Sequence[float],
-        in_force: NDArray[np.intp],
-        y: Array,
-        dy: Array,
-    ) -> bool:
-        point = [np.array(a) for a in (state.x, state.z, state.d, state.u)]
-        integers = [np.array(counts, dtype=np.int32), np.array(in_force, dtype=np.int32)]
-        steps = np.array(lengths, dtype=float)
-        done = self._compiled(
+    def _roll_compiled(self, state: State, moves: Array, horizon: Horizon, y: Array, dy: Array, dx: Array) -> bool:
+        assert self._library is not None
+        point = [np.array(a) for a in (state.x, state.z, state.d)]
+        pieces = (horizon.counts, horizon.lengths, horizon.moves, horizon.rows, horizon.ends)
+        done = self._library.pgexcite_rollout(
             RULES.index(self._rule),
-            len(counts),
-            _address(integers[0]),
-            _address(steps),
-            _address(integers[1]),
-            _address(self._commands),
+            len(horizon.counts),
+            *(_address(a) for a in (*pieces, self._commands)),
             state.startup,
-            *(_address(a) for a in point),
-            _address(np.ascontiguousarray(p)),
-            _address(moves),
+            *(_address(a) for a in (*point, horizon.p, horizon.u, moves)),
             int(dy.size > 0),
-            _address(y),
-            _address(dy),
+            *(_address(a) for a in (y, dy, dx)),
         )
-        return bool(done == len(counts))
+        return bool(done == len(horizon.counts))
 
-    def _roll(
-        self,
-        state: State,
-        p: Array,
-        moves: Array,
-        counts: Sequence[int],
-        lengths: Sequence[float],
-        in_force: NDArray[np.intp],
-        y: Array,
-        dy: Array,
-    ) -> bool:
+    def _condense(self, moves: NDArray[np.int32], dy: Array, dx: Array) -> Array:
+        """Chained transitions, shape ``(N, n_y, n_x + n_moves * n_u)``."""
+        N, n_x, n_u = len(moves), self._x.size, self._commands.size
+        columns = n_x + self._n_moves * n_u
+        G = np.empty((N, columns, self._outputs.size))
+        if self._library is not None:
+            X = np.empty((2, columns, n_x))
+            self._library.pgexcite_condense(N, self._n_moves, *(_address(a) for a in (moves, dy, dx, X, G)))
+            return G.transpose(0, 2, 1)
+        X = np.vstack((np.eye(n_x), np.zeros((columns - n_x, n_x))))
+        for j, move in enumerate(moves):
+            own = slice(n_x + move * n_u, n_x + (move + 1) * n_u)
+            G[j] = X @ dy[j, :n_x]
+            G[j, own] += dy[j, n_x:]
+            X = X @ dx[j, :n_x]
+            X[own] += dx[j, n_x:]
+        return G.transpose(0, 2, 1)
+
+    def _roll(self, state: State, moves: Array, horizon: Horizon, y: Array, dy: Array, dx: Array) -> bool:
         """The same in CasADi's virtual machine."""
         kernel, sense = self._kernel, dy.size > 0
-        kernel.begin(state, p)
-        startup = state.startup
-        self._S[:] = 0.0
-        self._S_c[:] = 0.0
-        for sample, (count, h, move) in enumerate(zip(counts, lengths, in_force, strict=True)):
-            if sample == 0 or move != in_force[sample - 1]:
-                changed = self._command(int(move), moves, sense=sense)
-                if changed is None:
-                    return False
-                startup = STARTUP_STEPS if changed else startup
+        kernel.begin(state.with_(u=horizon.u[0]), horizon.p[0])
+        self._S[:], self._S_c[:] = 0.0, 0.0
+        startup, sample, fresh, last = state.startup, 0, True, 0
+        for j, (count, h, move, row) in enumerate(
+            zip(horizon.counts, horizon.lengths, horizon.moves, horizon.rows, strict=True)
+        ):
+            changed = self._enter(horizon, moves[move], int(row), moved=j > 0 and row != last)
+            if changed is None:
+                return False
+            startup, last = STARTUP_STEPS if changed else startup, row
+            if sense and (fresh or changed):
+                self._point_at(int(move), fresh=fresh)
+                self._sense_settling()
             for _ in range(count):
-                stepped = self._take(h, startup, sense=sense)
+                stepped = self._take(float(h), startup, sense=sense)
                 if stepped is None:
                     return False
                 startup = stepped
-            self._output.trigger()
-            y[sample] = self._y
-            if sense:
-                dy[sample] = self._S_y
+            fresh = bool(horizon.ends[j])
+            if fresh:
+                self._output.trigger()
+                y[sample] = self._y
+                if sense:
+                    dy[sample] = self._S_y
+                if dx.size:
+                    dx[sample] = self._S[:, : self._x.size]
+                sample += 1
         return True
 
-    def _command(self, move: int, moves: Array, *, sense: bool) -> bool | None:
-        """Put a move in force; whether it changed anything, ``None`` where the algebraic unknowns have no solution then."""
-        kernel, n = self._kernel, self._commands.size
-        changed = not np.array_equal(kernel.u[self._commands], moves[move])
-        kernel.u[self._commands] = moves[move]
-        self._S_c[:] = 0.0
-        self._S_c[move * n + np.arange(n), np.arange(n)] = 1.0
-        if changed and not kernel.settle_here():
-            return None
-        if sense:
-            self._sense_settling()
+    def _enter(self, horizon: Horizon, move: Array, row: int, *, moved: bool) -> bool | None:
+        """Put a piece's commands and parameters in force; whether they changed, ``None`` where nothing satisfies them."""
+        kernel, u = self._kernel, horizon.u[row].copy()
+        u[self._commands] = move
+        changed = moved or not np.array_equal(u, kernel.u)
+        if changed:
+            here = State(0, 0.0, kernel.x, kernel.z, kernel.d, u)
+            kernel.begin(here, horizon.p[row])
+            if not kernel.settle_here():
+                return None
         return changed
+
+    def _point_at(self, move: int, *, fresh: bool) -> None:
+        """Directions of the sensitivities: the commands of a move, or each state and each command by itself."""
+        if self.transitions and not fresh:
+            return
+        n_x, n_u = self._x.size, self._commands.size
+        self._S_c[:] = 0.0
+        if self.transitions:
+            self._S[:] = 0.0
+            self._S[np.arange(n_x), np.arange(n_x)] = 1.0
+            self._S_c[n_x + np.arange(n_u), np.arange(n_u)] = 1.0
+        else:
+            self._S_c[move * n_u + np.arange(n_u), np.arange(n_u)] = 1.0
 
     def _take(self, h: float, startup: int, *, sense: bool) -> int | None:
         """One step; the startup steps left, ``None`` where it cannot be taken."""

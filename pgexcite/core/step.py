@@ -122,7 +122,8 @@ class Kernel:
 
     def constants(self) -> dict[str, object]:
         """What the C templates need to know of this kernel."""
-        sizes = {"n_x": self._n_x, "n_z": self.z.size, "n_d": self.d.size, "n_u": self.u.size, "n_y": self.y.size}
+        sizes = {"n_x": self._n_x, "n_z": self.z.size, "n_d": self.d.size, "n_u": self.u.size, "n_p": self.p.size}
+        sizes["n_y"] = self.y.size
         rule = {
             "gamma": repr(GAMMA),
             "alpha": repr(ALPHA),
