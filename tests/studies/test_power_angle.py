@@ -12,18 +12,18 @@ from pgexcite.studies.power_angle import Curve, EqualArea, lossless
 
 
 def swings_back(area, clearing):
-    """Whether the machine stays below a full turn: brute force, three seconds."""
+    """Whether the machine stays below a full turn: brute force, ten seconds (near the angle of no return all is slow)."""
 
     def slope(t, y):
         curve = area.during if t < clearing else area.after
         return y[1], math.pi * area.f_n / area.H * (area.p_m - curve(y[0]))
 
     first = solve_ivp(slope, (0, clearing), (area.delta_0, 0.0), rtol=1e-10, atol=1e-12)
-    then = solve_ivp(slope, (clearing, clearing + 3), first.y[:, -1], rtol=1e-10, atol=1e-12, max_step=0.01)
+    then = solve_ivp(slope, (clearing, clearing + 10), first.y[:, -1], rtol=1e-9, atol=1e-11, max_step=0.05)
     return bool(np.max(then.y[0]) < area.delta_limit + 0.2)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     delta_0=st.floats(0.2, 0.9),
     r_1=st.floats(0.0, 0.4),
@@ -36,10 +36,10 @@ def test_the_critical_time_separates_stable_from_lost(delta_0, r_1, weaker, offs
     area = EqualArea(0.8, delta_0, base.before, Curve(base.during.peak, offset, 0.1), base.after, H, 50.0)
     if area.delta_crit is None or area.t_crit is None:
         return
-    assert swings_back(area, 0.995 * area.t_crit)
-    assert not swings_back(area, 1.005 * area.t_crit)
-    assert area.delta_max(0.995 * area.t_crit) is not None
-    assert area.delta_max(1.005 * area.t_crit) is None
+    assert swings_back(area, 0.99 * area.t_crit)
+    assert not swings_back(area, 1.01 * area.t_crit)
+    assert area.delta_max(0.99 * area.t_crit) is not None
+    assert area.delta_max(1.01 * area.t_crit) is None
 
 
 def test_area_under_a_curve_is_its_integral():
