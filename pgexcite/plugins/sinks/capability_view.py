@@ -39,10 +39,13 @@ class CapabilityView:
         """One view, or tabs of them; none without units."""
         import rerun.blueprint as rrb
 
+        title = (
+            "operating point P-Q on the capability curve [pu of the machine]" if len(self.units) == 1 else "P-Q [pu]"
+        )
         views = [
             rrb.Spatial2DView(
                 origin=entity(device.path, ROOT),
-                name=f"{device.name}: operating point P-Q on the capability curve [pu of the machine]",
+                name=f"{device.name}: {title}",
                 visual_bounds=rrb.VisualBounds2D(x_range=[-30, 140], y_range=[-125, 125]),
                 background=rrb.Background(color=[16, 18, 20]),
             )

@@ -34,10 +34,17 @@ QUANTITIES = (
     Quantity("Rotor angle δ [deg]", (("delta", "δ"),)),
     Quantity("Rotor speed ω [pu]", (("omega", "ω"),)),
     Quantity("Terminal voltage V_t [pu]", (("v_t", "V_t"),), "RightBottom"),
-    Quantity("Field voltage E_fd and current i_fd [pu]", (("e_fd", "E_fd"), ("i_fd", "i_fd"))),
     Quantity("Active power P [pu of the machine]", (("p_e", "P"),)),
     Quantity("Reactive power Q [pu of the machine]", (("q_e", "Q"),)),
 )
+FIELD = Quantity("Field voltage E_fd and current i_fd [pu]", (("e_fd", "E_fd"), ("i_fd", "i_fd")))
+FIELD_APART = (
+    Quantity("Field voltage E_fd [pu]", (("e_fd", "E_fd"),)),
+    Quantity("Field current i_fd [pu]", (("i_fd", "i_fd"),)),
+)
+"""Instead of `FIELD` where there are more than two units."""
+BUSES = Quantity("Bus voltages [pu]", (), "RightBottom")
+"""Beside them, for an even number of plots: where there are few units the diagram shows the buses well enough."""
 DIAGNOSTICS = {"cost": "cost [-]", "solve_ms": "solve time [ms]"}
 """Controller signals with a plot in the overview, by the end of their name."""
 
@@ -111,7 +118,8 @@ class Overview:
     def _curves(self) -> list[tuple[Quantity, list[tuple[str, str, Colour]]]]:
         """The plots with anything in them, each with (entity, name, colour) of its series."""
         found = []
-        for quantity in QUANTITIES:
+        field = FIELD_APART if len(self.units) > 2 else (FIELD,)
+        for quantity in (*QUANTITIES[:3], *field, *QUANTITIES[3:]):
             series = []
             for k, device in enumerate(self.units):
                 for shade, (signal, label) in enumerate(quantity.signals):
@@ -121,6 +129,9 @@ class Overview:
                         series.append((where, f"{device.name} {label}", colour(k + shade * 5)))
             if series:
                 found.append((quantity, series))
+        buses = [bus for bus in self.system.buses if f"bus.{bus}.v" in self.signals]
+        if len(self.units) > 2 and buses:
+            found.append((BUSES, [(entity(f"bus.{bus}.v"), bus, colour(k)) for k, bus in enumerate(buses)]))
         return found
 
     def _diagnostics(self) -> list[Any]:

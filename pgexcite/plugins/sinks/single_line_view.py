@@ -19,8 +19,8 @@ _WIRE: Colour = (150, 160, 170)
 _OPEN: Colour = (70, 72, 76)
 _NOTE: Colour = (205, 212, 220)
 
-_ROOM_FOR_FLOWS = 15
-_ROOM_FOR_NAMES = 40
+_ROOM_FOR_FLOWS = 6
+_ROOM_FOR_NAMES = 30
 """In grids of more buses than this labels would cover one another; the viewer then shows one on hovering."""
 
 VOLTAGE_COLOURS = (
@@ -145,7 +145,8 @@ class SingleLineView:
         if self.buses:
             v = np.column_stack([trace[f"bus.{bus}.v"][shown] for bus in self.buses])
             rgb = voltage_colours(v.ravel())
-            text = [f"{bus}  {value:.3f} pu" for row in v for bus, value in zip(self.buses, row, strict=True)]
+            unit = " pu" if len(self.buses) <= _ROOM_FOR_FLOWS else ""
+            text = [f"{bus}  {value:.3f}{unit}" for row in v for bus, value in zip(self.buses, row, strict=True)]
             sizes = [len(self.buses)] * len(shown)
             stream.send_columns(f"{ROOT}/buses", index, rr.LineStrips2D.columns(colors=rgb).partition(sizes))
             stream.send_columns(
