@@ -195,6 +195,8 @@ class Symbols:
         }
         if component.has_terminal:
             known["v_re"], known["v_im"] = self.voltage[device.bus]
+        if device.path in self._network:
+            known["tap"] = self._network[device.path]["tap"]
         copy = self._copies[path]
         if not released:
             return copy.equations(Signals(known)), []
@@ -366,7 +368,10 @@ def _network(
         current = stated[device.path].current
         add(device.bus, (current[0] * ratio, current[1] * ratio), 1.0)
     for path, branch in system.branches().items():
-        g_ff, b_ff, g_ft, b_ft, g_tf, b_tf, g_tt, b_tt = branch.admittances(symbols.element(path))
+        p = symbols.element(path)
+        if path in stated:  # a tap changer drives this transformer's ratio
+            p = p | {"tap": stated[path].outputs["ratio"]}
+        g_ff, b_ff, g_ft, b_ft, g_tf, b_tf, g_tt, b_tt = branch.admittances(p)
         v_f, v_t = symbols.voltage[branch.from_bus], symbols.voltage[branch.to_bus]
         for end, bus, v, terms in (
             ("from", branch.from_bus, v_f, ((g_ff, b_ff, v_f), (g_ft, b_ft, v_t))),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from pgexcite.core.component import Component
-from pgexcite.core.declare import port_in, port_out
+from pgexcite.core.declare import par, port_in, port_out
 
 
 class Machine(Component):
@@ -70,6 +70,26 @@ class Load(Component):
 
     p = port_out("pu", "active power drawn")
     q = port_out("pu", "reactive power drawn")
+
+
+class TapChanger(Component):
+    """Drives the ratio of the transformer it belongs to from the voltage of one of that transformer's buses.
+
+    It reads the voltage of its device's bus and injects nothing there. Beside what every component is given it has ``tap``, the
+    transformer's own ratio: where the run starts. Its output replaces that ratio in the network's equations.
+    """
+
+    role: ClassVar[str] = "tap_changer"
+    has_terminal: ClassVar[bool] = True
+
+    regulates: Literal["to", "from"] = par("to", "-", "which of the transformer's buses has its voltage held")
+
+    ratio = port_out("-", "ratio of the transformer, sending side over receiving side")
+
+    @property
+    def _direction(self) -> int:
+        """Sign with which the ratio follows the voltage: at the receiving end a higher ratio lowers it."""
+        return 1 if self.regulates == "to" else -1
 
 
 class Source(Component):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from math import inf, radians
 from typing import Any
 
@@ -38,6 +38,7 @@ class DeviceReader:
         self._collect = collect
         readers: dict[str, Callable[[str, str, Mapping[str, Any]], dict[str, Any]]] = {
             **dict.fromkeys(_NETWORK, self._element),
+            "transformer": self._transformer,
             "infinite_bus": self._source,
             "unit": self._unit,
             "load": self._load,
@@ -57,12 +58,25 @@ class DeviceReader:
             self.broken.add(path)
         self.resolved.setdefault(kind, {})[name] = resolved
 
-    def _element(self, kind: str, name: str, table: Mapping[str, Any]) -> dict[str, Any]:
+    def _transformer(self, kind: str, name: str, table: Mapping[str, Any]) -> dict[str, Any]:
+        """A transformer, with the tap changer that drives its ratio as a device at the bus whose voltage it holds."""
+        path, slot = f"{kind}.{name}", tables.TAP_CHANGER
+        own = {key: value for key, value in table.items() if key != slot}
+        resolved = self._element(kind, name, own, also=[slot])
+        filled = self._slot(table, slot, slot, None, path) if slot in table else None
+        if filled is None or not resolved:
+            return resolved
+        model, component = filled
+        bus = resolved[component.regulates]
+        self.devices.append(Device(path, bus, self._S_base, {slot: component}, Schedule(P=0.0, Q=0.0)))
+        return resolved | {slot: {"model": model, **plain(component)}}
+
+    def _element(self, kind: str, name: str, table: Mapping[str, Any], *, also: Iterable[str] = ()) -> dict[str, Any]:
         path = f"{kind}.{name}"
         for end in ("bus", "from", "to"):
             if end in table:
                 self._check_bus(table[end], f"{path}.{end}")
-        element = self._collect.validate(_NETWORK[kind], table, path)
+        element = self._collect.validate(_NETWORK[kind], table, path, also=also)
         if element is None:
             return {}
         self.network[kind][name] = element
@@ -121,7 +135,7 @@ class DeviceReader:
 
     def _slot(
         self, table: Mapping[str, Any], slot: str, role: str, default: str | None, path: str
-    ) -> tuple[str, Component] | None:
+    ) -> tuple[str, Any] | None:
         """A slot's model by name and the component that fills it."""
         content: Any = table
         for key in slot.split("."):

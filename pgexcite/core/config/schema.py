@@ -41,7 +41,10 @@ def json_schema() -> dict[str, Any]:
     ):
         properties[name] = refer(name, cls.model_json_schema())
     for name, element in (("bus", Bus), ("line", Line), ("transformer", Transformer), ("shunt", Shunt)):
-        properties[name] = _by_name(refer(name, element.model_json_schema()))
+        schema = element.model_json_schema()
+        if element is Transformer:
+            schema["properties"][tables.TAP_CHANGER] = models(tables.TAP_CHANGER)
+        properties[name] = _by_name(refer(name, schema))
     for name, (role, own) in _BESIDE.items():
         properties[name] = _by_name(models(role, own))
     unit = tables.UnitTable.model_json_schema()

@@ -17,6 +17,9 @@ SLOTS = {
 }
 """Slots of a unit, each of the role of the same name, and the model that stands there when the file is silent."""
 
+TAP_CHANGER = "tap_changer"
+"""Slot of a transformer, and the role of what fills it."""
+
 
 class Table(BaseModel):
     """A table whose keys are all known and whose values are of the stated type: text is never taken for a number."""

@@ -16,7 +16,7 @@ class SEXS(Exciter):
 
         v_t -->[ 1/(1+sT_R) ]--(-)
         v_ref ------------------(+)-->[ (1+sT_A)/(1+sT_B) ]-->[ K/(1+sT_E) | E_MIN..E_MAX ]--> e_fd
-        v_s, v_uel, v_oel ------(+)
+        v_s, v_uel, v_oel, v_scl (+)
 
     PSS/E's record gives the ratio ``TA/TB`` in place of ``T_A`` and has no transducer (``T_R = 0``). The limits do not wind up.
 
@@ -37,6 +37,7 @@ class SEXS(Exciter):
 
     v_uel = port_in("pu", "underexcitation limiter's signal", default=0.0)
     v_oel = port_in("pu", "overexcitation limiter's signal", default=0.0)
+    v_scl = port_in("pu", "stator-current limiter's signal", default=0.0)
     v_m = state("pu", "sensed terminal voltage", guess=1.0)
     x_b = state("pu", "lead-lag")
     v_e = state("pu", "field voltage", guess=1.0)
@@ -44,7 +45,7 @@ class SEXS(Exciter):
 
     def equations(self, v: Signals) -> Equations:
         sensed = lag(v.v_t, v.v_m, T=self.T_R)
-        error = v.v_ref - sensed.y + v.v_s + v.v_uel + v.v_oel
+        error = v.v_ref - sensed.y + v.v_s + v.v_uel + v.v_oel + v.v_scl
         lead = lead_lag(error, v.x_b, T_lead=self.T_A, T_lag=self.T_B)
         exciter = lag(lead.y, v.v_e, T=self.T_E, K=self.K, lower=self.E_MIN, upper=self.E_MAX)
         return Equations(ode=(sensed, lead, exciter), out={"e_fd": exciter.y})

@@ -24,7 +24,7 @@ class ST1A(Exciter):
 
         v_t -->[ 1/(1+sT_R) ]--(-)
         v_ref ------------------(+)-->[clip V_IMIN..V_IMAX]-->(2)-->[ (1+sT_C)/(1+sT_B) ]-->[ (1+sT_C1)/(1+sT_B1) ]--+
-        v_s, v_uel, v_oel (1) --(+)                                                                                  |
+        v_s, v_scl, v_uel, v_oel (1) (+)                                                                               |
         [ sK_F/(1+sT_F) ] ------(-)                                                                                  |
             ^           +--------------------------------------------------------------------------------------------+
             |           +-->[ K_A/(1+sT_A) | V_AMIN..V_AMAX ]--(+)-->(3)-->[clip v_t V_RMIN .. v_t V_RMAX - K_C i_fd]--+--> e_fd
@@ -69,6 +69,7 @@ class ST1A(Exciter):
 
     v_uel = port_in("pu", "underexcitation limiter's signal", default=-_OUT_OF_REACH)
     v_oel = port_in("pu", "overexcitation limiter's signal", default=_OUT_OF_REACH)
+    v_scl = port_in("pu", "stator-current limiter's signal, summed at the input", default=0.0)
     v_m = state("pu", "sensed terminal voltage", guess=1.0)
     x_b = state("pu", "first lead-lag")
     x_b1 = state("pu", "second lead-lag")
@@ -95,7 +96,9 @@ class ST1A(Exciter):
         return clip(self._gates(v, 3, demand), v.v_t * self.V_RMIN, ceiling, "field voltage")
 
     def _summed(self, v: Signals) -> Expr:
-        total: Expr = v.v_s if self.pss_position == 1 else 0.0
+        total: Expr = v.v_scl
+        if self.pss_position == 1:
+            total += v.v_s
         if self.uel_position == 1:
             total += v.v_uel
         if self.oel_position == 1:

@@ -157,7 +157,10 @@ def _draw_devices(system: System, at: dict[str, Points], along: dict[str, Points
         away = at[branch.to_bus] - at[branch.from_bus]
         taken[branch.from_bus].append(_angle(away))
         taken[branch.to_bus].append(_angle(-away))
+    branches = system.branches()
     for device in system.devices:
+        if device.path in branches:  # a tap changer: the transformer stands for it
+            continue
         angle = _freest(taken[device.bus])
         taken[device.bus].append(angle)
         way = np.array([math.cos(angle), math.sin(angle)])

@@ -104,7 +104,7 @@ class SingleLineView:
             if lines:
                 strips = rr.LineStrips2D(lines, colors=colours, radii=[0.8] * len(lines), draw_order=22.0)
                 stream.log(f"{ROOT}/symbols/{kind}", strips, static=True)
-        names = {device.path: device.name for device in self.system.devices}
+        names = {device.path: device.name for device in self.system.devices if device.path in drawing.anchors}
         at = [drawing.anchors[path] for path in names]
         stream.log(
             f"{ROOT}/devices",
