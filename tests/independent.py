@@ -31,7 +31,7 @@ class Independent:
         """All of ``x`` and ``z`` from the dynamic states in ``x``, by plain Newton to rounding."""
         x, z, n = x.copy(), z.copy(), self.algebraic.size
         for _ in range(50):
-            r, J, f = (np.array(item) for item in self.solve(x, z, u, p))
+            r, J, _ = (np.array(item) for item in self.solve(x, z, u, p))
             step = np.linalg.solve(J, -r.ravel())
             x[self.algebraic] += step[:n]
             z += step[n:]
@@ -55,20 +55,22 @@ class Independent:
                 return f[self.dynamic] / self.mass
 
             wanted = times[(times > t + 1e-9) & (times <= until + 1e-9)]
+            reached = np.unique(np.append(np.clip(wanted, t, until), until))
             done = solve_ivp(
                 slope,
                 (t, until),
                 x[self.dynamic],
                 "Radau",
-                t_eval=np.clip(wanted, t, until),
+                t_eval=reached,
                 rtol=tolerance,
                 atol=tolerance,
             )
             assert done.success, done.message
-            for k, stamp in enumerate(wanted):
+            for k in range(reached.size):
                 x[self.dynamic] = done.y[:, k]
                 x, z, _ = self.algebraic_at(x, z, u, p)
-                rows.append(np.array(self.y(x, z, u, p)).ravel())
-                stamps.append(stamp)
+                if k < wanted.size:
+                    rows.append(np.array(self.y(x, z, u, p)).ravel())
+                    stamps.append(wanted[k])
             t = until
         return np.array(stamps), np.array(rows)
