@@ -148,9 +148,10 @@ class Symbols:
             _check_declared(path, component, equations)
             stated[path] = equations
             limits += [(path, limit) for limit in met]
-            for port in equations.out:
-                require(port not in outputs, f"{device.path}: two components drive {port!r}; leave one out")
-            outputs.update(equations.out)
+            for port, value in equations.out.items():
+                if port in outputs:
+                    _put_in_series(device, path, port, inputs, outputs)
+                outputs[port] = value
         substitute = _wiring(device, inputs, outputs)
         rows, alg, updates, holds = [], [], [], []
         current = (ca.SX(0), ca.SX(0))
@@ -167,12 +168,10 @@ class Symbols:
             updates += [
                 (f"{path}.{i.name}", substitute(equations.update[i.name])) for i in component.variables(Kind.DISCRETE)
             ]
-            holds += [
-                (f"{path}.{i.name}", substitute(equations.hold[i.name])) for i in component.variables(Kind.CONSTANT)
-            ]
+            holds += [(f"{path}.{name}", substitute(value)) for name, value in equations.hold.items()]
             if equations.current is not None:
                 current = (substitute(equations.current[0]), substitute(equations.current[1]))
-        wired = {port: substitute(value) for port, value in outputs.items()}
+        wired = {port: substitute(value) for port, value in outputs.items() if "<" not in port}
         bounded = tuple(
             (path, Limit(item.label, substitute(item.signal), substitute(item.lower), substitute(item.upper)))
             for path, item in limits
@@ -218,17 +217,30 @@ def _check_declared(path: str, component: Component, equations: Equations) -> No
         len(equations.alg) == count,
         f"{path}: {count} algebraic unknowns are declared, {len(equations.alg)} residuals are stated",
     )
-    for kind, stated in (
-        (Kind.OUTPUT, equations.out),
-        (Kind.DISCRETE, equations.update),
-        (Kind.CONSTANT, equations.hold),
-    ):
+    held = {name: value for name, value in equations.hold.items() if name not in declared[Kind.SETPOINT]}
+    for kind, stated in ((Kind.OUTPUT, equations.out), (Kind.DISCRETE, equations.update), (Kind.CONSTANT, held)):
         missing, extra = set(declared[kind]) - set(stated), set(stated) - set(declared[kind])
         require(not missing, f"{path}: {kind.value} {', '.join(sorted(missing))} declared but not stated")
         require(not extra, f"{path}: {kind.value} {', '.join(sorted(extra))} stated but not declared")
     require(
         not component.has_terminal or equations.current is not None, f"{path}: has a terminal but states no current"
     )
+
+
+def _put_in_series(
+    device: Device,
+    path: str,
+    port: str,
+    inputs: dict[str, list[tuple[str, Expr, float | None]]],
+    outputs: dict[str, Expr],
+) -> None:
+    """A component that both reads and drives a signal stands in series: it sees what the one before it drives."""
+    own = [user for user in inputs.get(port, []) if user[0] == path]
+    require(bool(own), f"{device.path}: two components drive {port!r}; leave one out")
+    inner = f"{port}<{path}"
+    inputs[port] = [user for user in inputs[port] if user[0] != path]
+    inputs[inner] = own
+    outputs[inner] = outputs[port]
 
 
 def _wiring(

@@ -23,7 +23,7 @@ class Equations:
         out: value of every declared output port.
         current: ``(i_re, i_im)`` injected into the bus, in per unit of the device's own base, for components with a terminal.
         update: next value of every declared discrete state, evaluated once per step.
-        hold: value at the initial point of every declared constant.
+        hold: value at the initial point of every declared constant, and of the set-points that the operating point leaves open.
     """
 
     ode: tuple[Block | Dynamics, ...] = ()

@@ -9,9 +9,12 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pgexcite.core.events import Change
+from pgexcite.core.measurement import Measurement
 from pgexcite.core.model import Model, State
 from pgexcite.core.settings import Rule
 from pgexcite.core.step import Kernel
+from pgexcite.core.system import System
 
 Array = NDArray[np.float64]
 
@@ -25,12 +28,16 @@ class Surroundings:
         rule: integration rule of the simulation.
         u_0: commands at the initial point, by path.
         y_0: outputs at the initial point, by path.
+        system: the grid as configured, for controllers that build a model of their own from its nameplate data.
+        changes: the events of the run, for controllers that declare some of them known.
     """
 
     h: float
     rule: Rule
     u_0: Mapping[str, float]
     y_0: Mapping[str, float]
+    system: System
+    changes: tuple[Change, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -54,12 +61,14 @@ class Sample:
 
     Attributes:
         t: s.
-        measured: signal path -> value, of the signals the controller asked for.
+        active: whether the controller is in charge; a controller on standby keeps track and its commands are not used.
+        measured: signal path -> value, of the signals the controller asked for; NaN where the sample was lost.
         state, p: the plant's state and parameters, for perfect information only, else ``None``.
     """
 
     t: float
     measured: Mapping[str, float]
+    active: bool = True
     state: State | None = None
     p: Array | None = None
 
@@ -73,6 +82,7 @@ class Action:
         diagnostics: name -> number, recorded as ``controller.<name>.<key>``.
         stage_cost: cost of the sample that just passed, by the controller's own cost function.
         fallback: whether its plan could not be used.
+        release: whether it hands control back to the classical controller, or takes it (``False``); ``None`` leaves that as it is.
         notes: lines for the log.
     """
 
@@ -80,6 +90,7 @@ class Action:
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     stage_cost: float = 0.0
     fallback: bool = False
+    release: bool | None = None
     notes: Sequence[str] = ()
 
 
@@ -88,6 +99,10 @@ class Session(Protocol):
 
     def act(self, sample: Sample) -> Action:
         """The commands for the interval that begins now."""
+        ...
+
+    def prepare(self) -> None:
+        """Work for the next sample that needs nothing of it; called once the commands are sent."""
         ...
 
     def memory(self) -> Mapping[str, Array]:
@@ -110,6 +125,16 @@ class Controller(Protocol):
     @property
     def information(self) -> Literal["perfect", "measured"]:
         """Whether it is handed the plant's state and model."""
+        ...
+
+    @property
+    def measurement(self) -> Measurement:
+        """What its instruments do to what it measures."""
+        ...
+
+    @property
+    def active(self) -> bool:
+        """Whether it is in charge from the start, or on standby."""
         ...
 
     def measures(self) -> Sequence[str]:

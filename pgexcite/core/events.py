@@ -120,7 +120,20 @@ class ParameterStep(_Event):
         return []
 
 
+class HandOver(_Event):
+    """Control passes to a controller, or from it back to the classical one."""
+
+    type: Literal["hand_over"]
+    controller: str
+    to: Literal["controller", "classical"]
+
+    def changes(self) -> tuple[Change, ...]:
+        active = {f"controller.{self.controller}.active": float(self.to == "controller")}
+        whom = self.controller if self.to == "controller" else "the classical controller"
+        return (Change(self.t, active, f"control passes to {whom}"),)
+
+
 Event = Annotated[
-    Fault | BranchTrip | BranchClose | LoadStep | ParameterStep,
+    Fault | BranchTrip | BranchClose | LoadStep | ParameterStep | HandOver,
     Field(discriminator="type"),
 ]

@@ -156,7 +156,7 @@ def _equations(
     rows = [row.rhs for _, row in stated.rows] + [e for _, e in stated.alg]
     rows += [by_path[path] - value for path, value in stated.holds]
     setpoints = sum(len(c.variables(Kind.SETPOINT)) for c in device.components.values())
-    if setpoints == len(names) - len(rows) == 2:
+    if setpoints >= len(names) - len(rows) == 2:
         rows += [stated.current[0] - terminal.i.real, stated.current[1] - terminal.i.imag]
     require(
         len(rows) == len(names),

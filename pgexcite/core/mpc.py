@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.controller import Plant, Sample, Surroundings
+from pgexcite.core.events import Change
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,7 @@ class Status(Enum):
     CONVERGED = "the plan satisfies its optimality conditions"
     ITERATED = "the allowed iterations were used; the plan is feasible and better than the one it started from"
     PREDICTION_FAILED = "the model could not be stepped over the horizon; shorten the horizon or the prediction step"
+    STATE_UNKNOWN = "the state is not known: no usable measurement, or the estimator has diverged"
     QP_FAILED = "the quadratic program was not solved; check weights and bounds for infinities and contradictions"
 
     @property
@@ -35,47 +37,102 @@ class Status(Enum):
 
 
 @dataclass(frozen=True)
+class SoftBound:
+    """A bound on an output that may be crossed at a price: ``weight * excess^2`` in each sample.
+
+    Attributes:
+        path: the output.
+        lower, upper: bounds in the output's unit; infinite where there is none.
+        weight: price of a unit of excess, squared.
+    """
+
+    path: str
+    lower: float
+    upper: float
+    weight: float
+
+
+@dataclass(frozen=True)
 class Problem:
     """An excitation control problem over a receding horizon.
 
     Attributes:
         dt: sample time, s.
         N_p: prediction horizon, samples.
-        N_c: control horizon, moves; the command is held after the last.
+        blocks: length of each move in samples; the last is held to the end. ``N_c`` moves of one sample are ``(1,) * N_c``.
         commands: set-point paths, ``n_u`` of them.
         voltages: paths of the outputs held at ``V_ref``.
         speeds: paths of the speeds held at 1 pu.
-        Q, P, R: weights on voltage error, speed error and move.
+        Q, P, R: weights on voltage errors, speed errors and moves, shapes ``(len(voltages),)``, ``(len(speeds),)``, ``(n_u,)``.
         u_min, u_max: bounds on the commands, shape ``(n_u,)``.
         du_max: bound on a move, shape ``(n_u,)``; infinite where there is none.
         V_ref: voltage references, pu, shape ``(len(voltages),)``.
+        terminal: factor on ``Q`` and ``P`` at the last sample.
+        soft: soft bounds on outputs.
+        growth: ratio of consecutive prediction intervals; 1 is uniform. The first is ``dt``.
+        previews: known changes to come of ``V_ref``, as ``(t, V_ref)`` in order of time.
+        known: known disturbances to come.
+        delayed: whether a plan takes one sample to compute: it is made for the sample after the one it is made in.
+        fixed: set-points that hold while the controller is in charge (the field transfer's ``manual``).
     """
 
     dt: float
     N_p: int
-    N_c: int
+    blocks: tuple[int, ...]
     commands: tuple[str, ...]
     voltages: tuple[str, ...]
     speeds: tuple[str, ...]
-    Q: float
-    P: float
-    R: float
+    Q: Array
+    P: Array
+    R: Array
     u_min: Array
     u_max: Array
     du_max: Array
     V_ref: Array
+    terminal: float = 1.0
+    soft: tuple[SoftBound, ...] = ()
+    growth: float = 1.0
+    previews: tuple[tuple[float, Array], ...] = ()
+    known: tuple[Change, ...] = ()
+    delayed: bool = False
+    fixed: Mapping[str, float] = field(default_factory=dict)
 
-    def moves_per_sample(self) -> NDArray[np.intp]:
-        """Which of the ``N_c`` moves is in force in each of the ``N_p`` samples, shape ``(N_p,)``."""
-        return np.minimum(np.arange(self.N_p), self.N_c - 1)
+    @property
+    def N_c(self) -> int:
+        """Number of moves."""
+        return len(self.blocks)
 
-    def stage_cost(self, voltages: Array, speeds: Array, move: Array) -> float:
-        """Cost of one sample: ``voltages`` and ``speeds`` at its end, ``move`` at its beginning."""
-        return float(
-            self.Q * np.sum((self.V_ref - voltages) ** 2)
-            + self.P * np.sum((1.0 - speeds) ** 2)
-            + self.R * np.sum(move**2)
-        )
+    def moves_per_sample(self) -> NDArray[np.int32]:
+        """Which of the moves is in force in each of the ``N_p`` samples, shape ``(N_p,)``."""
+        listed = np.repeat(np.arange(self.N_c), self.blocks)[: self.N_p]
+        return np.concatenate((listed, np.full(self.N_p - listed.size, self.N_c - 1))).astype(np.int32)
+
+    def intervals(self) -> Array:
+        """Length of each prediction interval, s, shape ``(N_p,)``."""
+        return self.dt * np.power(self.growth, np.arange(self.N_p, dtype=np.float64))
+
+    def shifted(self, plan: Array) -> Array:
+        """A plan one sample later: each move is what was in force one sample after its own beginning, shape ``(N_c, n_u)``."""
+        starts = np.concatenate(([0], np.cumsum(self.blocks)[:-1]))
+        return plan[self.moves_per_sample()[np.minimum(starts + 1, self.N_p - 1)]]
+
+    def references(self, t: float) -> Array:
+        """``V_ref`` at the end of each interval of a horizon that begins at ``t``, shape ``(N_p, len(voltages))``."""
+        ends = t + np.cumsum(self.intervals())
+        return np.array([self.reference_at(end) for end in ends]).reshape(self.N_p, -1)
+
+    def reference_at(self, t: float) -> Array:
+        """``V_ref`` in force at ``t``, previews included."""
+        value = self.V_ref
+        for instant, following in self.previews:
+            if instant <= t + 1e-9:
+                value = following
+        return value
+
+    def stage_cost(self, t: float, voltages: Array, speeds: Array, move: Array) -> float:
+        """Cost of the sample that ends at ``t``: ``voltages`` and ``speeds`` at its end, ``move`` at its beginning."""
+        error = self.reference_at(t) - voltages
+        return float(np.sum(self.Q * error**2) + np.sum(self.P * (1.0 - speeds) ** 2) + np.sum(self.R * move**2))
 
 
 @dataclass(frozen=True)
@@ -89,6 +146,7 @@ class Solution:
         iterations: QPs solved.
         step: largest change of a command in the last iteration; how far from converged it may still be.
         times_ms: phase -> wall time, ms.
+        diagnostics: further numbers worth recording (an estimator's states and covariances), by name.
     """
 
     status: Status
@@ -97,13 +155,23 @@ class Solution:
     iterations: int
     step: float
     times_ms: Mapping[str, float] = field(default_factory=dict)
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
 
 
 class Solver(Protocol):
     """A backend at work on one problem in one run."""
 
     def solve(self, sample: Sample, u_last: Array) -> Solution:
-        """The plan from this sample on; ``u_last`` are the commands in force, shape ``(n_u,)``."""
+        """The plan from this sample on (from the next one, where the problem is ``delayed``).
+
+        Args:
+            sample: what is known at this instant.
+            u_last: the commands in force until the plan begins, shape ``(n_u,)``.
+        """
+        ...
+
+    def prepare(self, u: Array) -> None:
+        """Work that can be done before the next sample is known; ``u`` is what was sent."""
         ...
 
     def memory(self) -> Mapping[str, Array]:

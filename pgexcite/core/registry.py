@@ -24,6 +24,7 @@ GROUPS = {
     "tap_changer": "pgexcite.tap_changers",
     "load": "pgexcite.loads",
     "source": "pgexcite.sources",
+    "transfer": "pgexcite.transfers",
     "controller": "pgexcite.controllers",
     "estimator": "pgexcite.estimators",
     "mpc_backend": "pgexcite.mpc_backends",
@@ -32,7 +33,7 @@ GROUPS = {
 """Entry-point group of every role."""
 
 COMPONENT_ROLES = frozenset(
-    {"machine", "exciter", "stabiliser", "limiter", "governor", "tap_changer", "load", "source"}
+    {"machine", "exciter", "stabiliser", "limiter", "governor", "tap_changer", "load", "source", "transfer"}
 )
 """Roles whose classes are components, with equations the kernel assembles."""
 

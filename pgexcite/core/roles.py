@@ -39,6 +39,20 @@ class Exciter(Component):
     e_fd = port_out("pu", "field voltage")
 
 
+class _DrivesField(Component):
+    e_fd = port_out("pu", "field voltage")
+
+
+class Transfer(_DrivesField):
+    """Stands in series between the excitation system and the field: reads the exciter's ``e_fd`` and drives the machine's."""
+
+    role: ClassVar[str] = "transfer"
+
+    e_fd = port_in("pu", "field voltage of the excitation system")
+    v_t = port_in("pu", "terminal voltage")
+    i_fd = port_in("pu", "field current")
+
+
 class Stabiliser(Component):
     """A power system stabiliser: from speed or power to a signal at the regulator's input."""
 

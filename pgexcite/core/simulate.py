@@ -16,6 +16,7 @@ from pgexcite.core.diagnose import diagnose, smallest_singular_value
 from pgexcite.core.errors import ConfigError, Problem, SnapshotError
 from pgexcite.core.events import Change
 from pgexcite.core.initialise import Initial, initialise
+from pgexcite.core.measurement import Instruments
 from pgexcite.core.model import Model, State
 from pgexcite.core.result import ControllerStatistics, RunResult
 from pgexcite.core.settings import Settings
@@ -56,9 +57,10 @@ class _Running:
 
     controller: Controller
     session: Session
+    instruments: Instruments
     every: int
-    measures: Array
-    names: tuple[str, ...]
+    columns: NDArray[np.int_]
+    active: bool
     t: list[float] = field(default_factory=list)
     diagnostics: list[Mapping[str, float]] = field(default_factory=list)
     solve_ms: list[float] = field(default_factory=list)
@@ -212,7 +214,8 @@ class Simulation:
         problems = []
         for change in self._changes:
             for path in (*change.values, *(change.increments or {})):
-                if path not in self.model.index["u"] and path not in self.model.index["p"]:
+                known = path in self.model.index["u"] or path in self.model.index["p"]
+                if not known and _switched(path) not in self._controllers:
                     near = _nearest(self.model, path)
                     problems.append(
                         Problem(path, f"no such parameter or set-point (event at t = {change.t:g} s)", hint=near)
@@ -228,6 +231,9 @@ class Simulation:
         u, p = self.state.u.copy(), self.p.copy()
         for values, add in ((change.values, False), (change.increments or {}, True)):
             for path, value in values.items():
+                if _switched(path):
+                    self._running[_switched(path)].active = value > 0
+                    continue
                 array, group = (u, "u") if path in self.model.index["u"] else (p, "p")
                 k = self.model.position(group, path)
                 array[k] = array[k] + value if add else value
@@ -271,10 +277,12 @@ class Simulation:
                 ]
             )
         surroundings = Surroundings(
-            self.settings.h,
-            self.settings.rule,
-            dict(zip(self.model.u_names, s.u, strict=True)),
-            dict(zip(self.model.y_names, y, strict=True)),
+            h=self.settings.h,
+            rule=self.settings.rule,
+            u_0=dict(zip(self.model.u_names, s.u, strict=True)),
+            y_0=dict(zip(self.model.y_names, y, strict=True)),
+            system=self.model.system,
+            changes=tuple(self._changes),
         )
         plant = None
         if controller.information == "perfect":
@@ -283,30 +291,41 @@ class Simulation:
             )
         names = tuple(controller.measures())
         columns = np.array([self.model.position("y", path) for path in names], dtype=int)
-        return _Running(controller, controller.start(surroundings, plant), every, columns, names)
+        session = controller.start(surroundings, plant)
+        instruments = Instruments(controller.measurement, names)
+        return _Running(controller, session, instruments, every, columns, controller.active)
 
     def _control(self) -> None:
+        due = {name: r for name, r in self._running.items() if self.state.k % r.every == 0}
+        if not due:
+            return
         u = self.state.u.copy()
-        for name, running in self._running.items():
-            if self.state.k % running.every:
-                continue
-            s = self.state
-            y = self.kernel.outputs(s, self.p)
-            measured = dict(zip(running.names, y[running.measures], strict=True))
-            perfect = running.controller.information == "perfect"
-            sample = Sample(s.t, measured, s if perfect else None, self.p.copy() if perfect else None)
-            began = time.perf_counter()
-            action = running.session.act(sample)
-            running.solve_ms.append(1e3 * (time.perf_counter() - began))
-            running.t.append(s.t)
-            running.diagnostics.append(action.diagnostics)
-            running.cost += action.stage_cost
-            running.fallbacks += action.fallback
-            self._recording.log += [LogEntry(s.t, "controller", f"{name}: {note}") for note in action.notes]
-            for path, value in action.commands.items():
-                u[self.model.position("u", path)] = value
+        y = self.kernel.outputs(self.state, self.p)
+        for name, running in due.items():
+            self._call(name, running, y, u)
         if not np.array_equal(u, self.state.u):
             self._jump(u, self.p)
+        for running in due.values():
+            running.session.prepare()
+
+    def _call(self, name: str, running: _Running, y: Array, u: Array) -> None:
+        """Let a controller act; its commands go into ``u``."""
+        s = self.state
+        perfect = running.controller.information == "perfect"
+        measured = running.instruments.read(s.k // running.every, y[running.columns])
+        sample = Sample(s.t, measured, running.active, s if perfect else None, self.p.copy() if perfect else None)
+        began = time.perf_counter()
+        action = running.session.act(sample)
+        running.solve_ms.append(1e3 * (time.perf_counter() - began))
+        running.t.append(s.t)
+        if action.release is not None:
+            running.active = not action.release
+        running.diagnostics.append({**action.diagnostics, "active": float(running.active)})
+        running.cost += action.stage_cost
+        running.fallbacks += action.fallback
+        self._recording.log += [LogEntry(s.t, "controller", f"{name}: {note}") for note in action.notes]
+        for path, value in action.commands.items():
+            u[self.model.position("u", path)] = value
 
     # What is left behind.
 
@@ -345,6 +364,9 @@ class Simulation:
             for name, r in self._running.items()
             for key, value in r.session.memory().items()
         }
+        for name, r in self._running.items():
+            memory[f"instruments:{name}"] = r.instruments.memory()
+            memory[f"active:{name}"] = np.array(float(r.active))
         memory["applied"] = np.array(len(self._changes) - len(self._pending))
         self.state.save(path, self.model, self.p, memory)
 
@@ -362,9 +384,17 @@ class Simulation:
             if not own and running.session.memory():
                 raise SnapshotError(f"{path}: holds nothing of the controller {name!r}")
             running.session.recall(own)
+            running.instruments.recall(memory[f"instruments:{name}"])
+            running.active = bool(memory[f"active:{name}"] > 0)
         self._pending = self._changes[int(memory["applied"]) :]
         self._recording = _Recording()
         self._record_point()
+
+
+def _switched(path: str) -> str:
+    """The controller that a path ``controller.NAME.active`` switches, or ``""``."""
+    head, _, name = path.removesuffix(".active").partition(".")
+    return name if head == "controller" and path.endswith(".active") else ""
 
 
 def _held(t: Array, instants: list[float], values: list[float]) -> Array:

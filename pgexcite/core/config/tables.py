@@ -14,6 +14,7 @@ SLOTS = {
     "governor": "constant_torque",
     "stabiliser": None,
     "limiter": None,
+    "transfer": None,
 }
 """Slots of a unit, each of the role of the same name, and the model that stands there when the file is silent."""
 

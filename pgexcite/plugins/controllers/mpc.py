@@ -6,27 +6,37 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from pgexcite.core.controller import Action, Plant, Sample, Session, Surroundings, as_arrays
+from pgexcite.core.controller import Plant, Session, Surroundings
 from pgexcite.core.declare import par
 from pgexcite.core.errors import ConfigError, Problem, RegistryError
-from pgexcite.core.mpc import Backend, Solver, Status
+from pgexcite.core.events import Change
+from pgexcite.core.ladder import Actuator, Ladder, LadderOptions
+from pgexcite.core.measurement import Measurement
+from pgexcite.core.mpc import Backend, SoftBound
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.registry import find
 
-Array = NDArray[np.float64]
 
-_SETPOINT = {"e_fd": "e_fd_ref", "v_ref": "v_ref"}
+class Soft(BaseModel):
+    """A soft bound on an output of the unit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    signal: str = Field(description="output of the unit: v_t, i_fd, delta, ...")
+    lower: float = par(-1e6, "pu or rad", "lower bound")
+    upper: float = par(1e6, "pu or rad", "upper bound")
+    weight: float = par(1e3, "-", "price of a unit of excess, squared, in each sample", gt=0)
 
 
 class MPC(BaseModel):
     """Receding-horizon control of one unit's excitation with the cost of equation (2) (see ``pgexcite.core.mpc``).
 
-    Each sample a plan of ``N_c`` moves is found and its first move is sent. A plan that fails or is not finite never reaches the
-    plant: the last plan's next move is used instead, for ``max_reuse`` samples at the most, then the last command is held; the log
-    and the summary say so.
+    Commands go to the unit's field transfer where it has one (``command = "e_fd"``: the exciter stands by, and control passes both
+    ways without a bump), else straight to a constant-field exciter, or to a regulator's set-point (``command = "v_ref"``).
+
+    A plan that fails, is late, leaves its bounds or is not finite never reaches the plant: see ``pgexcite.core.ladder``.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -40,26 +50,53 @@ class MPC(BaseModel):
     options: Mapping[str, Any] = Field(default_factory=dict, description="parameters of the backend")
     dt: float = par(0.05, "s", "sample time", gt=0)
     N_p: int = par(5, "-", "prediction horizon, samples", ge=1)
-    N_c: int = par(1, "-", "control horizon, moves; the command is held after the last", ge=1)
+    N_c: int = par(1, "-", "control horizon, moves of one sample; the command is held after the last", ge=1)
+    blocks: tuple[int, ...] = Field((), description="lengths of the moves in samples, instead of N_c (move blocking)")
+    growth: float = par(1.0, "-", "ratio of consecutive prediction intervals", ge=1)
     Q: float = par(300.0, "-", "weight on the voltage error", ge=0)
     P: float = par(5.0, "-", "weight on the speed error", ge=0)
     R: float = par(0.01, "-", "weight on the move", ge=0)
+    terminal: float = par(1.0, "-", "factor on Q and P at the last sample", gt=0)
     u_min: float = par(-3.2, "pu", "lower bound of the command")
     u_max: float = par(3.2, "pu", "upper bound of the command")
     du_max: float = par(1e6, "pu", "largest move in one sample", gt=0)
+    soft: tuple[Soft, ...] = Field((), description="soft bounds on outputs of the unit")
     V_ref: float = par(0.0, "pu", "voltage reference; 0 takes the initial terminal voltage", ge=0)
+    V_ref_known: tuple[tuple[float, float], ...] = Field(
+        (), description="changes of V_ref known in advance, as [t, V_ref]"
+    )
+    disturbance_known: bool = Field(False, description="whether the events of the run are known in advance")
+    delayed: bool = Field(False, description="whether a plan takes one sample to compute, and is made for the next")
+    active: bool = Field(True, description="whether it is in charge from the start, or on standby")
+    measurement: Measurement = Field(Measurement(), description="what its instruments do")
     max_reuse: int = par(3, "-", "samples an old plan is followed when no new one is found", ge=0)
+    max_age: int = par(3, "-", "samples without a measurement after which it is stale", ge=0)
+    recover_after: int = par(
+        10, "-", "good plans in a row after which control is taken back from the classical controller", ge=1
+    )
+    deadline_ms: float = par(0.0, "ms", "time a plan may take; 0 sets no deadline", ge=0)
+    v_ref_rate: float = par(0.01, "pu/s", "rate at which a set-point returns after control is handed back", gt=0)
+
+    @field_validator("backend")
+    @classmethod
+    def _known_backend(cls, name: str) -> str:
+        try:
+            find("mpc_backend", name)
+        except RegistryError as cause:
+            raise ValueError(str(cause)) from cause
+        return name
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.u_min >= self.u_max:
             raise ValueError(f"u_min = {self.u_min} must be below u_max = {self.u_max}")
-        if self.N_c > self.N_p:
+        if self.blocks and (min(self.blocks) < 1 or sum(self.blocks) > self.N_p):
+            raise ValueError(
+                f"blocks = {list(self.blocks)} must be positive and add up to N_p = {self.N_p} at the most"
+            )
+        if not self.blocks and self.N_c > self.N_p:
             raise ValueError(f"N_c = {self.N_c} must not exceed N_p = {self.N_p}")
-        try:
-            self._backend()
-        except RegistryError as cause:
-            raise ValueError(str(cause)) from cause
+        self._backend()
         return self
 
     def _backend(self) -> Backend:
@@ -71,98 +108,86 @@ class MPC(BaseModel):
         """That of the backend."""
         return self._backend().information
 
-    @property
-    def setpoint(self) -> str:
-        """Path of the set-point it commands."""
-        return f"unit.{self.unit}.exciter.{_SETPOINT[self.command]}"
-
     def measures(self) -> Sequence[str]:
-        """Terminal voltage and speed of its unit."""
-        return (f"unit.{self.unit}.v_t", f"unit.{self.unit}.omega")
+        """The unit's own terminals: voltage, speed, powers, field voltage and current."""
+        signals = ["v_t", "omega", "p_e", "q_e", "e_fd", "i_fd"]
+        return [
+            f"unit.{self.unit}.{name}" for name in dict.fromkeys([*signals, *(bound.signal for bound in self.soft)])
+        ]
+
+    def actuator(self, setpoints: Mapping[str, float]) -> Actuator:
+        """Where its commands go.
+
+        Raises:
+            ConfigError: the unit has no such set-point.
+        """
+        unit = f"unit.{self.unit}"
+        if self.command == "e_fd" and f"{unit}.transfer.e_fd_cmd" in setpoints:
+            return Actuator(
+                f"{unit}.transfer.e_fd_cmd", f"{unit}.e_fd", {f"{unit}.transfer.manual": 1.0}, returns=False
+            )
+        path = f"{unit}.exciter.{'e_fd_ref' if self.command == 'e_fd' else 'v_ref'}"
+        if path not in setpoints:
+            text = f"commands {path}, which does not exist"
+            hint = 'command = "e_fd" goes with the exciter "constant_field" or a transfer, command = "v_ref" with a regulator'
+            raise ConfigError([Problem("controller.command", text, self.command, hint)])
+        return Actuator(path, None, {}, returns=self.command == "v_ref")
 
     def start(self, surroundings: Surroundings, plant: Plant | None) -> Session:
         """Begin a run.
 
         Raises:
-            ConfigError: the unit has no such set-point, or its initial value is outside the bounds.
+            ConfigError: the unit has no such set-point, its initial value is outside the bounds, or a soft bound is on an output
+                that does not exist.
         """
-        voltage, speed = self.measures()
-        u_0 = surroundings.u_0.get(self.setpoint)
-        if u_0 is None:
-            text = f"commands {self.setpoint}, which does not exist"
-            hint = 'command = "e_fd" goes with the exciter "constant_field", command = "v_ref" with a regulator'
-            raise ConfigError([Problem("controller.command", text, self.command, hint)])
+        actuator = self.actuator(surroundings.u_0)
+        u_0 = surroundings.u_0[actuator.setpoint]
         if not self.u_min <= u_0 <= self.u_max:
-            text = f"the initial value of {self.setpoint} is outside u_min = {self.u_min:g} .. u_max = {self.u_max:g}"
+            text = (
+                f"the initial value of {actuator.setpoint} is outside u_min = {self.u_min:g} .. u_max = {self.u_max:g}"
+            )
             raise ConfigError(
                 [Problem("controller", text, round(u_0, 5), "widen the bounds or move the operating point")]
             )
-        problem = ControlProblem(
+        problem = self._problem(actuator, surroundings)
+        solver = self._backend().start(problem, surroundings, plant)
+        options = LadderOptions(
+            max_reuse=self.max_reuse,
+            max_age=self.max_age,
+            recover_after=self.recover_after,
+            deadline_ms=self.deadline_ms,
+            return_rate=self.v_ref_rate,
+            perfect=self.information == "perfect",
+        )
+        return Ladder(problem, solver, actuator, options, np.array([u_0]))
+
+    def _problem(self, actuator: Actuator, surroundings: Surroundings) -> ControlProblem:
+        unit = f"unit.{self.unit}"
+        voltage = f"{unit}.v_t"
+        known: tuple[Change, ...] = ()
+        if self.disturbance_known:
+            known = tuple(
+                c for c in surroundings.changes if not any(path.startswith("controller.") for path in c.values)
+            )
+        return ControlProblem(
             dt=self.dt,
             N_p=self.N_p,
-            N_c=self.N_c,
-            commands=(self.setpoint,),
+            blocks=self.blocks or (1,) * self.N_c,
+            commands=(actuator.setpoint,),
             voltages=(voltage,),
-            speeds=(speed,),
-            Q=self.Q,
-            P=self.P,
-            R=self.R,
+            speeds=(f"{unit}.omega",),
+            Q=np.array([self.Q]),
+            P=np.array([self.P]),
+            R=np.array([self.R]),
             u_min=np.array([self.u_min]),
             u_max=np.array([self.u_max]),
-            du_max=np.array([self.du_max]),
+            du_max=np.array([self.du_max if self.du_max < 1e6 else np.inf]),
             V_ref=np.array([self.V_ref or surroundings.y_0[voltage]]),
+            terminal=self.terminal,
+            soft=tuple(SoftBound(f"{unit}.{s.signal}", s.lower, s.upper, s.weight) for s in self.soft),
+            growth=self.growth,
+            previews=tuple((t, np.array([value])) for t, value in sorted(self.V_ref_known)),
+            known=known,
+            delayed=self.delayed,
+            fixed=actuator.engaged,
         )
-        return _Session(self, problem, self._backend().start(problem, surroundings, plant), np.array([u_0]))
-
-
-class _Session:
-    """The controller at work: the plan in force and the command last sent."""
-
-    def __init__(self, config: MPC, problem: ControlProblem, solver: Solver, u_0: Array) -> None:
-        self._config, self._problem, self._solver = config, problem, solver
-        self._u, self._move = u_0, np.zeros_like(u_0)
-        self._plan = np.tile(u_0, (problem.N_c, 1))
-        self._age = 0
-
-    def act(self, sample: Sample) -> Action:
-        problem = self._problem
-        voltages = np.array([sample.measured[path] for path in problem.voltages])
-        speeds = np.array([sample.measured[path] for path in problem.speeds])
-        passed = problem.stage_cost(voltages, speeds, self._move) if sample.t > 0 else 0.0
-        solution = self._solver.solve(sample, self._u)
-        notes: list[str] = []
-        usable = solution.status.usable and self._admissible(solution.u)
-        if usable:
-            self._plan, self._age = solution.u, 0
-        else:
-            self._age += 1
-            reused = self._age <= self._config.max_reuse
-            why = solution.status.value if not solution.status.usable else "the plan leaves its bounds or is not finite"
-            notes.append(f"{'the last plan is followed' if reused else 'the last command is held'}: {why}")
-            if not reused:
-                self._plan = np.tile(self._u, (problem.N_c, 1))
-        u = self._plan[min(self._age, problem.N_c - 1)]
-        self._move, self._u = u - self._u, u
-        diagnostics = {
-            "predicted_cost": solution.cost,
-            "iterations": float(solution.iterations),
-            "converged": float(solution.status is Status.CONVERGED),
-            "solve_ms": solution.times_ms.get("total", np.nan),
-        }
-        commands = dict(zip(problem.commands, (float(value) for value in u), strict=True))
-        return Action(commands, diagnostics, passed, not usable, notes)
-
-    def _admissible(self, u: Array) -> bool:
-        slack = 1e-9
-        inside = (u >= self._problem.u_min - slack) & (u <= self._problem.u_max + slack)
-        return bool(np.isfinite(u).all() and inside.all())
-
-    def memory(self) -> Mapping[str, Array]:
-        own = as_arrays({"u": self._u, "move": self._move, "plan": self._plan, "age": self._age})
-        return own | {f"solver:{key}": value for key, value in self._solver.memory().items()}
-
-    def recall(self, memory: Mapping[str, Array]) -> None:
-        self._u, self._move, self._plan = memory["u"], memory["move"], memory["plan"]
-        self._age = int(memory["age"])
-        start = "solver:"
-        self._solver.recall({key.removeprefix(start): value for key, value in memory.items() if key.startswith(start)})

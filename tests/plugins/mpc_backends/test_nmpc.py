@@ -27,20 +27,30 @@ def make(t, rule="tr_bdf2", **changes):
     sim.run(until=t)
     model = sim.model
     values = {
-        "dt": 0.05, "N_p": 5, "N_c": 3, "commands": (COMMAND,), "voltages": ("unit.G2.v_t",), "speeds": ("unit.G2.omega",),
-        "Q": 300.0, "P": 5.0, "R": 0.01, "u_min": np.array([-3.2]), "u_max": np.array([3.2]), "du_max": np.array([np.inf]),
+        "dt": 0.05,
+        "N_p": 5,
+        "blocks": (1, 1, 1),
+        "commands": (COMMAND,),
+        "voltages": ("unit.G2.v_t",),
+        "speeds": ("unit.G2.omega",),
+        "Q": np.array([300.0]),
+        "P": np.array([5.0]),
+        "R": np.array([0.01]),
+        "u_min": np.array([-3.2]),
+        "u_max": np.array([3.2]),
+        "du_max": np.array([np.inf]),
         "V_ref": np.array([1.0]),
-    }  # fmt: skip
+    }
     problem = Problem(**(values | changes))
-    surroundings = Surroundings(H, rule, dict(zip(model.u_names, sim.state.u, strict=True)), {})
+    surroundings = Surroundings(H, rule, dict(zip(model.u_names, sim.state.u, strict=True)), {}, model.system)
     plant = Plant(model, Kernel(model, sim.initial.state, sim.initial.p, "never"), sim.p)
-    solver = NMPC(max_iterations=100, tolerance=1e-9).start(problem, surroundings, plant)
+    solver = NMPC(mode="converged", max_iterations=100, tolerance=1e-9).start(problem, surroundings, plant)
     return sim, problem, solver
 
 
 def solve(sim, solver):
     u = np.array([sim.get(COMMAND)])
-    return u, solver.solve(Sample(sim.state.t, {}, sim.state, sim.p), u)
+    return u, solver.solve(Sample(sim.state.t, {}, True, sim.state, sim.p), u)
 
 
 def gradient(sim, problem, plan, u_last):
@@ -58,9 +68,9 @@ def gradient(sim, problem, plan, u_last):
             state = kernel.advance(state, sim.p, "tr_bdf2", H, round(problem.dt / H)).state
             y = kernel.outputs(state, sim.p)
             v, omega = y[sim.model.position("y", "unit.G2.v_t")], y[sim.model.position("y", "unit.G2.omega")]
-            total += problem.Q * (1.0 - v) ** 2 + problem.P * (1 - omega) ** 2
+            total += problem.Q[0] * (1.0 - v) ** 2 + problem.P[0] * (1 - omega) ** 2
         for j in range(problem.N_c):
-            total += problem.R * (moves[j, 0] - last) ** 2
+            total += problem.R[0] * (moves[j, 0] - last) ** 2
             last = moves[j, 0]
         return total
 
@@ -74,7 +84,7 @@ def gradient(sim, problem, plan, u_last):
 
 
 @pytest.mark.parametrize("t", [0.12, 0.22, 0.4])
-@pytest.mark.parametrize("weights", [{}, {"Q": 3.0, "R": 1.0}])
+@pytest.mark.parametrize("weights", [{}, {"Q": np.array([3.0]), "R": np.array([1.0])}])
 def test_converged_plan_satisfies_the_optimality_conditions_of_the_true_problem(t, weights):
     sim, problem, solver = make(t, **weights)
     u_last, solution = solve(sim, solver)
@@ -118,10 +128,10 @@ def ipopt_plan(sim, problem, u_last):
             equalities += [mass * (xm - x) - c * (f0 + fm), gm, mass * (x1 - alpha * xm + beta * x) - c * f1, g1]
             x, z = x1, z1
         y = model.dae(x, z, model.d_0, u, sim.p, 0.0)[6]
-        cost += problem.Q * (1.0 - y[iv]) ** 2 + problem.P * (1 - y[iw]) ** 2
+        cost += problem.Q[0] * (1.0 - y[iv]) ** 2 + problem.P[0] * (1 - y[iw]) ** 2
     last = u_last[0]
     for move in U:
-        cost += problem.R * (move - last) ** 2
+        cost += problem.R[0] * (move - last) ** 2
         last = move
     w = ca.vertcat(*unknowns)
     options = {"ipopt.print_level": 0, "print_time": False, "ipopt.tol": 1e-11, "ipopt.bound_relax_factor": 0.0}
@@ -135,7 +145,9 @@ def ipopt_plan(sim, problem, u_last):
 
 
 @pytest.mark.parametrize("t", [0.12, 0.22, 0.4])
-@pytest.mark.parametrize("changes", [{"N_c": 1}, {"N_c": 3, "Q": 3.0, "R": 0.1}])
+@pytest.mark.parametrize(
+    "changes", [{"blocks": (1,)}, {"blocks": (1, 1, 1), "Q": np.array([3.0]), "R": np.array([0.1])}]
+)
 def test_converged_plan_is_that_of_an_independent_solver(t, changes):
     sim, problem, solver = make(t, **changes)
     u_last, solution = solve(sim, solver)
@@ -146,7 +158,7 @@ def test_converged_plan_is_that_of_an_independent_solver(t, changes):
 
 
 def test_bounds_on_the_move_hold():
-    sim, problem, solver = make(0.22, du_max=np.array([0.3]))
+    sim, _, solver = make(0.22, du_max=np.array([0.3]))
     u_last, solution = solve(sim, solver)
     moves = np.diff(solution.u.ravel(), prepend=u_last)
     assert np.abs(moves).max() == pytest.approx(0.3, abs=1e-8)

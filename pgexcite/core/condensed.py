@@ -1,0 +1,164 @@
+"""The quadratic program of a problem condensed to its moves: what every backend builds from a prediction and its derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgexcite.core.mpc import Problem
+from pgexcite.core.qp import QPSolution, QuadraticProgram
+
+Array = NDArray[np.float64]
+
+
+class QPSolver(Protocol):
+    """Solves ``min x'Hx/2 + g'x`` subject to box and rows; see ``pgexcite.core.qp``."""
+
+    def solve(
+        self,
+        H: Array,
+        g: Array,
+        lower: Array,
+        upper: Array,
+        rows: Array | None = None,
+        rows_lower: Array | None = None,
+        rows_upper: Array | None = None,
+    ) -> QPSolution:
+        """Solve; ``solved`` says whether it did."""
+        ...
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A prediction around a plan.
+
+    Attributes:
+        y: predicted outputs ``(voltages, speeds, soft-bounded)`` at the end of each sample, shape ``(N_p, n_y)``.
+        G: derivatives to the moves, shape ``(N_p, n_y, N_c * n_u)``.
+        references: of the voltages, shape ``(N_p, n_voltages)``.
+    """
+
+    y: Array
+    G: Array
+    references: Array
+
+
+class Condensed:
+    """Cost and quadratic programs of one problem.
+
+    Outputs come in the order voltages, speeds, soft-bounded. Soft bounds get a slack each, so that a program always has a solution.
+
+    Args:
+        problem: the control problem.
+        solver: of programs with ``variables`` variables and ``rows`` rows; ProxQP where left out.
+    """
+
+    def __init__(self, problem: Problem, solver: QPSolver | None = None) -> None:
+        self.problem = problem
+        n_u, self._n_soft = len(problem.commands), len(problem.soft)
+        self.n = problem.N_c * n_u
+        self._n_slack = self._n_soft * problem.N_p
+        self._rate = bool(np.isfinite(problem.du_max).any())
+        self.variables = self.n + self._n_slack
+        self.rows = (self.n if self._rate else 0) + 2 * self._n_slack
+        self.solver: QPSolver = solver or QuadraticProgram(self.variables, self.rows)
+        # Moves are differences of consecutive commands: moves = difference @ plan - (last command, 0, ...).
+        self._difference = np.eye(self.n) - np.eye(self.n, k=-n_u)
+        weights = np.concatenate((problem.Q, problem.P))
+        self._weights = np.tile(weights, (problem.N_p, 1))
+        self._weights[-1] *= problem.terminal
+        self._n_tracked = weights.size
+        self._R = np.tile(problem.R, problem.N_c)
+        self._move_hessian = 2 * (self._difference.T * self._R) @ self._difference
+        self._lower, self._upper = np.tile(problem.u_min, problem.N_c), np.tile(problem.u_max, problem.N_c)
+        self._du_max = np.tile(problem.du_max, problem.N_c)
+        self._soft_lower = np.array([bound.lower for bound in problem.soft])
+        self._soft_upper = np.array([bound.upper for bound in problem.soft])
+        self._soft_weight = np.array([bound.weight for bound in problem.soft])
+
+    def outputs(self) -> tuple[str, ...]:
+        """Paths of the outputs a prediction must give."""
+        return (*self.problem.voltages, *self.problem.speeds, *(bound.path for bound in self.problem.soft))
+
+    def _moves(self, plan: Array, u_last: Array) -> Array:
+        return np.diff(plan, axis=0, prepend=u_last[None]).ravel()
+
+    def _errors(self, y: Array, references: Array) -> Array:
+        target = np.ones((y.shape[0], self._n_tracked))
+        target[:, : references.shape[1]] = references
+        return y[:, : self._n_tracked] - target
+
+    def cost(self, y: Array, references: Array, plan: Array, u_last: Array) -> float:
+        """Cost of a plan, soft bounds included."""
+        errors, moves = self._errors(y, references), self._moves(plan, u_last)
+        total = np.sum(errors * errors * self._weights) + np.sum(self._R * moves * moves)
+        if self._n_soft:
+            total += np.sum(self._soft_weight * self._excess(y) ** 2)
+        return float(total)
+
+    def _excess(self, y: Array) -> Array:
+        soft = y[:, self._n_tracked :]
+        return np.maximum(soft - self._soft_upper, 0.0) + np.maximum(self._soft_lower - soft, 0.0)
+
+    def quadratic(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, Array]:
+        """Gauss-Newton Hessian and gradient of the tracked cost in the plan, shapes ``(n, n)`` and ``(n,)``; no soft bounds."""
+        J = at.G[:, : self._n_tracked].reshape(-1, self.n)
+        weighted = J.T * self._weights.ravel()
+        H = 2 * (weighted @ J) + self._move_hessian
+        moves = self._R * self._moves(plan, u_last)
+        g = 2 * (weighted @ self._errors(at.y, at.references).ravel() + self._difference.T @ moves)
+        return H, g
+
+    def direction(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, float] | None:
+        """The program's step from a plan, shape ``(N_c, n_u)``, and its slope of the cost; ``None`` where it was not solved."""
+        H, g = self.quadratic(at, plan, u_last)
+        slope_of = g
+        lower, upper = self._lower - plan.ravel(), self._upper - plan.ravel()
+        rows = rows_lower = rows_upper = None
+        if self.rows:
+            rows, rows_lower, rows_upper = self._constraints(at, plan, u_last)
+        if self._n_slack:
+            weights = np.tile(self._soft_weight, self.problem.N_p)
+            H = np.block(
+                [[H, np.zeros((self.n, self._n_slack))], [np.zeros((self._n_slack, self.n)), np.diag(2 * weights)]]
+            )
+            g = np.concatenate((g, np.zeros(self._n_slack)))
+            lower = np.concatenate((lower, np.zeros(self._n_slack)))
+            upper = np.concatenate((upper, np.full(self._n_slack, np.inf)))
+        solution = self.solver.solve(H, g, lower, upper, rows, rows_lower, rows_upper)
+        if not solution.solved:
+            return None
+        step = solution.x[: self.n]
+        slope = float(slope_of @ step)
+        if self._n_soft:
+            crossed = self._excess(at.y)
+            sides = np.sign(at.y[:, self._n_tracked :] - self._soft_upper)
+            slope += float(np.sum(2 * self._soft_weight * crossed * sides * (at.G[:, self._n_tracked :] @ step)))
+        return step.reshape(plan.shape), slope
+
+    def _constraints(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, Array, Array]:
+        blocks, low, high = [], [], []
+        if self._rate:
+            moves = self._moves(plan, u_last)
+            blocks.append(np.hstack((self._difference, np.zeros((self.n, self._n_slack)))))
+            low.append(-self._du_max - moves)
+            high.append(self._du_max - moves)
+        if self._n_slack:
+            G = at.G[:, self._n_tracked :].reshape(-1, self.n)
+            y = at.y[:, self._n_tracked :].ravel()
+            slack, nothing = np.eye(self._n_slack), np.full(self._n_slack, np.inf)
+            upper, lower = (
+                np.tile(self._soft_upper, self.problem.N_p) - y,
+                np.tile(self._soft_lower, self.problem.N_p) - y,
+            )
+            blocks += [np.hstack((G, -slack)), np.hstack((G, slack))]
+            low += [-nothing, lower]
+            high += [upper, nothing]
+        return np.vstack(blocks), np.concatenate(low), np.concatenate(high)
+
+    def clipped(self, plan: Array) -> Array:
+        """A plan within the bounds on commands."""
+        return np.clip(plan, self.problem.u_min, self.problem.u_max)

@@ -1,0 +1,101 @@
+"""Horizons of a control problem: its intervals cut into steps, with what is known to happen on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgexcite.core.events import Change
+from pgexcite.core.model import Model
+from pgexcite.core.mpc import Problem
+from pgexcite.core.prediction import Horizon
+
+Array = NDArray[np.float64]
+
+_SAME_INSTANT = 1e-9
+
+
+@dataclass(frozen=True)
+class Horizons:
+    """Makes the horizon of each sample.
+
+    Args:
+        model: the model that predicts.
+        problem: the control problem.
+        h: prediction step in the first interval, s; it grows with the intervals.
+        grid: the plant's step, s: a known event takes place at the first step boundary not before it.
+    """
+
+    model: Model
+    problem: Problem
+    h: float
+    grid: float
+
+    def at(self, t: float, u: Array, p: Array) -> Horizon:
+        """The horizon that begins at ``t`` with commands ``u`` and parameters ``p`` in force."""
+        problem = self.problem
+        count = max(1, round(problem.dt / self.h))
+        ends = t + np.cumsum(problem.intervals())
+        pending = [(self._instant(change), change) for change in problem.known]
+        pending = [item for item in pending if t + _SAME_INSTANT < item[0] < ends[-1] - _SAME_INSTANT]
+        row_u, row_p = self._fixed(u), np.array(p, dtype=float)
+        us, ps = [row_u], [row_p]
+        pieces: list[tuple[int, float, int, int, int]] = []
+        here = t
+        for end, interval, move in zip(ends, problem.intervals(), problem.moves_per_sample(), strict=True):
+            h = interval / count
+            while pending and pending[0][0] < end - _SAME_INSTANT:
+                instant, change = pending.pop(0)
+                pieces += _piece(instant - here, h, int(move), len(ps) - 1, ends=False)
+                row_u, row_p = self._changed(row_u, row_p, change)
+                us.append(row_u)
+                ps.append(row_p)
+                here = max(here, instant)
+            pieces += _piece(end - here, h, int(move), len(ps) - 1, ends=True)
+            here = end
+            while pending and pending[0][0] <= end + _SAME_INSTANT:
+                _, change = pending.pop(0)
+                row_u, row_p = self._changed(row_u, row_p, change)
+                us.append(row_u)
+                ps.append(row_p)
+        counts, lengths, moves, rows, closing = zip(*pieces, strict=True)
+        return Horizon(
+            counts=np.array(counts, dtype=np.int32),
+            lengths=np.array(lengths),
+            moves=np.array(moves, dtype=np.int32),
+            rows=np.array(rows, dtype=np.int32),
+            ends=np.array(closing, dtype=np.int32),
+            p=np.array(ps),
+            u=np.array(us),
+        )
+
+    def _instant(self, change: Change) -> float:
+        return float(np.ceil(change.t / self.grid - 1e-6) * self.grid)
+
+    def _fixed(self, u: Array) -> Array:
+        u = np.array(u, dtype=float)
+        for path, value in self.problem.fixed.items():
+            u[self.model.position("u", path)] = value
+        return u
+
+    def _changed(self, u: Array, p: Array, change: Change) -> tuple[Array, Array]:
+        """Commands and parameters after a change; what this model does not have is left out."""
+        u, p, index = u.copy(), p.copy(), self.model.index
+        for values, add in ((change.values, 0.0), (change.increments or {}, 1.0)):
+            for path, value in values.items():
+                for array, group in ((u, "u"), (p, "p")):
+                    if path in index[group]:
+                        k = index[group][path]
+                        array[k] = add * array[k] + value
+        return self._fixed(u), p
+
+
+def _piece(duration: float, h: float, move: int, row: int, *, ends: bool) -> Sequence[tuple[int, float, int, int, int]]:
+    """A piece of this duration in equal steps of about ``h``; none for a duration of zero that ends no sample."""
+    if duration <= _SAME_INSTANT and not ends:
+        return []
+    count = max(1, int(np.ceil(duration / h - 1e-6)))
+    return [(count, duration / count, move, row, int(ends))]

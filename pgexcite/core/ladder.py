@@ -1,0 +1,222 @@
+"""The controller at work: plan, old plan, classical controller - and back. Nothing else ever reaches the plant.
+
+    level 0   the plan of this sample: found, in time, finite, within its bounds
+    level 1   the next move of the last good plan, for ``max_reuse`` samples at the most
+    level 2   the classical controller, bumplessly; where there is none, the last command is held
+    up        after ``recover_after`` good plans in a row control is taken back from level 2
+
+Every step down and up is in the log; the summary counts the samples in which a plan could not be used.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgexcite.core.controller import Action, Sample, as_arrays
+from pgexcite.core.mpc import Problem, Solution, Solver, Status
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """Where commands go.
+
+    Attributes:
+        setpoint: path of the set-point commanded.
+        feedback: path of the measured signal that says what is really in force, or ``None`` where the command always is.
+        engaged: set-points that put the controller in charge; their opposites (0 for 1) hand back. Empty where there is nobody to
+            hand back to.
+        returns: whether the set-point goes back to its initial value after control is handed back.
+    """
+
+    setpoint: str
+    feedback: str | None
+    engaged: Mapping[str, float] = field(default_factory=dict)
+    returns: bool = False
+
+    @property
+    def has_classical(self) -> bool:
+        """Whether a classical controller stands behind this one."""
+        return bool(self.engaged) or self.returns
+
+
+@dataclass(frozen=True)
+class LadderOptions:
+    """When to step down and up; see ``pgexcite.plugins.controllers.mpc.MPC``."""
+
+    max_reuse: int
+    max_age: int
+    recover_after: int
+    deadline_ms: float
+    return_rate: float
+    perfect: bool
+
+
+class Ladder:
+    """A controller in one run (the ``Session`` of ``pgexcite.core.controller``)."""
+
+    def __init__(
+        self, problem: Problem, solver: Solver, actuator: Actuator, options: LadderOptions, u_0: Array
+    ) -> None:
+        self.problem, self.solver, self.actuator, self.options = problem, solver, actuator, options
+        self._u_0 = u_0
+        self._u, self._move = u_0, np.zeros_like(u_0)
+        self._next = u_0
+        self._plan = np.tile(u_0, (problem.N_c, 1))
+        self._reused = 0
+        self._stale = 0
+        self._good = 0
+        self._in_charge = False
+        self._stepped_down = False
+
+    # The protocol of a session.
+
+    def act(self, sample: Sample) -> Action:
+        """One sample: plan, judge the plan, command."""
+        notes: list[str] = []
+        passed = self._passed(sample)
+        self._take_bearings(sample)
+        began = time.perf_counter()
+        solution = self.solver.solve(sample, self._next if self.problem.delayed else self._u)
+        elapsed = 1e3 * (time.perf_counter() - began)
+        why = self._objection(sample, solution, elapsed)
+        self._good = 0 if why else self._good + 1
+        if not why:
+            self._plan, self._reused = solution.u, 0
+        diagnostics = {
+            "level": float(self._level(why, active=sample.active)),
+            "predicted_cost": solution.cost,
+            "iterations": float(solution.iterations),
+            "converged": float(solution.status is Status.CONVERGED),
+            **{f"{phase}_ms": value for phase, value in solution.times_ms.items()},
+            **solution.diagnostics,
+        }
+        action = self._active(why, notes) if sample.active else self._standby(why, notes)
+        return Action(action.commands, diagnostics, passed, bool(why) and sample.active, action.release, tuple(notes))
+
+    def prepare(self) -> None:
+        """Let the solver prepare the next sample."""
+        self.solver.prepare(self._next if self.problem.delayed else self._u)
+
+    def memory(self) -> Mapping[str, Array]:
+        """All that is kept between samples."""
+        names = ("u", "move", "next", "plan", "reused", "stale", "good", "in_charge", "stepped_down")
+        own = as_arrays({name: getattr(self, f"_{name}") for name in names})
+        return own | {f"solver:{key}": value for key, value in self.solver.memory().items()}
+
+    def recall(self, memory: Mapping[str, Array]) -> None:
+        """Take up where ``memory`` left off."""
+        self._u, self._move, self._next, self._plan = (memory[name] for name in ("u", "move", "next", "plan"))
+        self._reused, self._stale, self._good = (int(memory[name]) for name in ("reused", "stale", "good"))
+        self._in_charge, self._stepped_down = bool(memory["in_charge"] > 0), bool(memory["stepped_down"] > 0)
+        start = "solver:"
+        self.solver.recall({key.removeprefix(start): value for key, value in memory.items() if key.startswith(start)})
+
+    # Before the plan.
+
+    def _passed(self, sample: Sample) -> float:
+        """Cost of the sample that ends now; nothing where its measurement was lost."""
+        if sample.t <= 0:
+            return 0.0
+        voltages = np.array([sample.measured[path] for path in self.problem.voltages])
+        speeds = np.array([sample.measured[path] for path in self.problem.speeds])
+        cost = self.problem.stage_cost(sample.t, voltages, speeds, self._move)
+        return cost if np.isfinite(cost) else 0.0
+
+    def _take_bearings(self, sample: Sample) -> None:
+        """How old the measurement is and, until in charge, what is in force."""
+        lost = not np.isfinite(list(sample.measured.values())).all()
+        self._stale = self._stale + 1 if lost else 0
+        if not (sample.active and self._in_charge) and self.actuator.feedback is not None and not lost:
+            in_force = np.array([sample.measured[self.actuator.feedback]])
+            self._u = self._next = np.clip(in_force, self.problem.u_min, self.problem.u_max)
+
+    # After it.
+
+    def _objection(self, sample: Sample, solution: Solution, elapsed_ms: float) -> str:
+        """Why this plan may not be used; ``""`` where it may."""
+        options = self.options
+        if not options.perfect and self._stale > options.max_age:
+            return f"the measurement is {self._stale} samples old"
+        if not solution.status.usable:
+            return solution.status.value
+        if not np.isfinite(solution.u).all():
+            return "the plan is not finite"
+        slack = 1e-9
+        if (solution.u < self.problem.u_min - slack).any() or (solution.u > self.problem.u_max + slack).any():
+            return "the plan leaves its bounds"
+        if options.deadline_ms and elapsed_ms > options.deadline_ms:
+            return f"the plan came after {elapsed_ms:.3g} ms, later than its deadline of {options.deadline_ms:g} ms"
+        return ""
+
+    def _level(self, why: str, *, active: bool) -> int:
+        if not active:
+            return 2
+        if not why:
+            return 0
+        return 1 if self._reused < self.options.max_reuse else 2
+
+    def _active(self, why: str, notes: list[str]) -> Action:
+        """In charge: this plan, or the old one, or down to the classical controller."""
+        if not self._in_charge:
+            self._in_charge, self._stepped_down = True, False
+            notes.append("takes charge")
+        if why:
+            if self._reused == 0:
+                notes.append(f"the last plan is followed: {why}")
+            self._reused += 1
+            if self._reused > self.options.max_reuse:
+                return self._step_down(why, notes)
+            self._plan = self.problem.shifted(self._plan)
+        elif self._reused:
+            self._reused = 0
+        u = self._command(self._plan[0])
+        self._move, self._u = u - self._u, u
+        return Action({self.actuator.setpoint: float(u[0]), **self.actuator.engaged})
+
+    def _command(self, first: Array) -> Array:
+        """What is sent now; with computing delay the plan's first move waits one sample."""
+        first = np.clip(first, self.problem.u_min, self.problem.u_max)
+        if not self.problem.delayed:
+            return first
+        now, self._next = self._next, first
+        return now
+
+    def _step_down(self, why: str, notes: list[str]) -> Action:
+        if not self.actuator.has_classical:
+            if self._reused == self.options.max_reuse + 1:
+                notes.append(f"the last command is held, for there is no classical controller: {why}")
+            self._move = np.zeros_like(self._u)
+            return Action({self.actuator.setpoint: float(self._u[0])})
+        notes.append(f"hands over to the classical controller: {why}")
+        self._in_charge, self._stepped_down = False, True
+        self._move = np.zeros_like(self._u)
+        return Action(dict.fromkeys(self.actuator.engaged, 0.0), release=True)
+
+    def _standby(self, why: str, notes: list[str]) -> Action:
+        """Not in charge: keep track; come back after a fault of one's own, once plans are good again."""
+        commands: dict[str, float] = {}
+        self._move = np.zeros_like(self._u)
+        if self._in_charge:
+            self._in_charge = False
+            notes.append("hands over to the classical controller, as told")
+            commands = dict.fromkeys(self.actuator.engaged, 0.0)
+        if self._stepped_down and not why and self._good >= self.options.recover_after:
+            notes.append(f"plans have been good for {self._good} samples: control is taken back")
+            self._reused = 0
+            return Action(commands, release=False)
+        if self.actuator.returns:
+            self._u = self._next = self._returned()
+            commands[self.actuator.setpoint] = float(self._u[0])
+        return Action(commands)
+
+    def _returned(self) -> Array:
+        """The set-point on its way back to where it was before this controller moved it."""
+        reach = self.options.return_rate * self.problem.dt
+        return self._u + np.clip(self._u_0 - self._u, -reach, reach)

@@ -1,0 +1,256 @@
+"""Single shooting on a model: real-time iterations or converged plans, from wherever the state is taken from."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pgexcite.core.condensed import Condensed, Linearised, QPSolver
+from pgexcite.core.controller import Sample
+from pgexcite.core.horizons import Horizons
+from pgexcite.core.model import State
+from pgexcite.core.mpc import Problem, Solution, Status
+from pgexcite.core.prediction import Predictor
+from pgexcite.core.qp import QuadraticProgram
+from pgexcite.core.settings import Rule
+from pgexcite.core.step import Kernel
+
+Array = NDArray[np.float64]
+
+_SHORTEST = 1.0 / 256.0
+"""Shortest fraction of a Gauss-Newton step the line search tries."""
+_DECREASE = 1e-4
+"""Armijo's constant: the share of the predicted decrease that must be had."""
+
+
+@dataclass(frozen=True)
+class ShootingOptions:
+    """How far a plan is iterated.
+
+    Attributes:
+        mode: ``"rti"`` solves one prepared QP a sample, ``"converged"`` iterates every plan.
+        max_iterations: QPs for one plan at the most, when converging.
+        jump_iterations: QPs for one plan where the state is not what was expected.
+        jump: difference of a state from what was expected that counts as a jump.
+        tolerance: largest change of a command at which a plan has converged.
+    """
+
+    mode: Literal["rti", "converged"] = "rti"
+    max_iterations: int = 20
+    jump_iterations: int = 4
+    jump: float = 1e-3
+    tolerance: float = 1e-6
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A linearisation made before its sample: around ``plan``, from the state expected then."""
+
+    plan: Array
+    x: Array
+    p: Array
+    y: Array
+    G: Array
+    G_x: Array
+
+
+class Shooting(ABC):
+    """Plans by shooting. A backend says where the state comes from (``locate``) and may change the parameters ``p``.
+
+    Args:
+        kernel: of the model that predicts; the solver has it for itself.
+        problem: the control problem; its paths are those of the model.
+        options: how far plans are iterated.
+        rule: integration rule of the prediction.
+        h: prediction step in the first interval, s.
+        grid: the plant's step, s.
+        qp: solver of the programs; ProxQP where left out.
+    """
+
+    def __init__(
+        self,
+        kernel: Kernel,
+        problem: Problem,
+        options: ShootingOptions,
+        *,
+        rule: Rule,
+        h: float,
+        grid: float,
+        qp: QPSolver | None = None,
+    ) -> None:
+        self.kernel, self.problem, self.options = kernel, problem, options
+        self._rule, self._h = rule, h
+        self.condensed = Condensed(problem, qp)
+        model = kernel.model
+        self._commands = [model.position("u", path) for path in problem.commands]
+        outputs = [model.position("y", path) for path in self.condensed.outputs()]
+        prepares = options.mode == "rti"
+        self.predictor = Predictor(
+            kernel, self._commands, outputs, problem.N_c, rule, transitions=True if prepares else None
+        )
+        self._horizons = Horizons(model, problem, h, grid)
+        self._plan: Array | None = None
+        self._prepared: _Prepared | None = None
+        self._from: tuple[State, float] | None = None
+        self.p: Array = np.empty(0)
+
+    @abstractmethod
+    def locate(self, sample: Sample) -> State | None:
+        """The model's state at this sample; sets ``self.p``. ``None`` where it is not known."""
+
+    # The protocol of a solver.
+
+    def solve(self, sample: Sample, u_last: Array) -> Solution:
+        """The plan from this sample on; see ``pgexcite.core.mpc.Solver``."""
+        began = time.perf_counter()
+        state = self.locate(sample)
+        located = time.perf_counter()
+        solution = self._from_state(state, sample.t, u_last)
+        times = {"locate": 1e3 * (located - began), "feedback": 1e3 * (time.perf_counter() - located)}
+        return replace(solution, times_ms=times)
+
+    def prepare(self, u: Array) -> None:
+        """Linearise around the plan the next sample will start from, at the state expected then."""
+        self._prepared = None
+        if self.options.mode != "rti" or self._from is None or self._plan is None:
+            return
+        state, t = self._from
+        expected = self._advance(state, t, u)
+        if expected is None:
+            return
+        plan = self.condensed.clipped(self.problem.shifted(self._plan))
+        horizon = self._horizons.at(t + self.problem.dt, expected.u, self.p)
+        rollout = self.predictor.roll(expected, plan, horizon, derivatives=True)
+        if rollout is not None and rollout.dy is not None and rollout.dx is not None:
+            self._prepared = _Prepared(plan, expected.x, self.p, rollout.y, rollout.dy, rollout.dx)
+
+    def memory(self) -> Mapping[str, Array]:
+        """Plan, linearisation and the QP's warm start."""
+        kept: dict[str, Array] = {}
+        if self._plan is not None:
+            kept["plan"] = self._plan
+        if self._prepared is not None:
+            kept |= {f"prepared:{name}": value for name, value in vars(self._prepared).items()}
+        if isinstance(solver := self.condensed.solver, QuadraticProgram):
+            kept["multipliers"] = solver.memory()
+        return kept
+
+    def recall(self, memory: Mapping[str, Array]) -> None:
+        """Take up where ``memory`` left off."""
+        self._plan = memory.get("plan")
+        start = "prepared:"
+        prepared = {key.removeprefix(start): value for key, value in memory.items() if key.startswith(start)}
+        self._prepared = _Prepared(**prepared) if prepared else None
+        if isinstance(solver := self.condensed.solver, QuadraticProgram):
+            solver.recall(memory["multipliers"])
+
+    # Planning.
+
+    def _from_state(self, state: State | None, t: float, u_last: Array) -> Solution:
+        hold = self.condensed.clipped(np.tile(u_last, (self.problem.N_c, 1)))
+        if state is None:
+            return Solution(Status.STATE_UNKNOWN, hold, np.inf, 0, np.inf)
+        if self.problem.delayed:
+            later = self._advance(state, t, u_last)
+            if later is None:
+                return Solution(Status.PREDICTION_FAILED, hold, np.inf, 0, np.inf)
+            state, t = later, t + self.problem.dt
+        self._from = (state, t)
+        expected = self._expected(state)
+        if expected is not None:
+            solution = self._feedback(expected, state, t, u_last)
+        else:
+            converge = self.options.mode == "converged" or self._plan is None
+            count = self.options.max_iterations if converge else self.options.jump_iterations
+            solution = self._iterate(state, t, u_last, hold, count)
+        if solution.status.usable:
+            self._plan = solution.u
+        return solution
+
+    def _advance(self, state: State, t: float, u: Array) -> State | None:
+        """The state one sample later under these commands, with what is known to happen; ``None`` if it cannot be had."""
+        horizon = self._horizons.at(t, state.u, self.p)
+        last = int(np.flatnonzero(horizon.ends)[0]) + 1
+        row = -1
+        for count, h, k in zip(horizon.counts[:last], horizon.lengths[:last], horizon.rows[:last], strict=True):
+            if k != row:
+                wanted = horizon.u[k].copy()
+                wanted[self._commands] = u
+                if row >= 0 or not np.array_equal(wanted, state.u):
+                    settled = self.kernel.settle(state.with_(u=wanted), horizon.p[k])
+                    if settled is None:
+                        return None
+                    state = settled
+                row = int(k)
+            segment = self.kernel.advance(state, horizon.p[k], self._rule, float(h), int(count))
+            if segment.failed:
+                return None
+            state = segment.state
+        return state
+
+    def _expected(self, state: State) -> _Prepared | None:
+        """The linearisation prepared for this sample, unless the state or the network is not what was expected."""
+        ready = self._prepared
+        if ready is None or not np.array_equal(ready.p, self.p):
+            return None
+        return ready if np.abs(state.x - ready.x).max(initial=0.0) <= self.options.jump else None
+
+    def _feedback(self, ready: _Prepared, state: State, t: float, u_last: Array) -> Solution:
+        """One QP around what was prepared, corrected for the state."""
+        y = ready.y + ready.G_x @ (state.x - ready.x)
+        at = Linearised(y, ready.G, self.problem.references(t))
+        found = self.condensed.direction(at, ready.plan, u_last)
+        if found is None:
+            return Solution(Status.QP_FAILED, ready.plan, np.inf, 1, np.inf)
+        step, _ = found
+        plan = self.condensed.clipped(ready.plan + step)
+        cost = self.condensed.cost(y + ready.G @ step.ravel(), at.references, plan, u_last)
+        return Solution(Status.ITERATED, plan, cost, 1, float(np.abs(step).max()))
+
+    def _iterate(self, state: State, t: float, u_last: Array, hold: Array, count: int) -> Solution:
+        """Gauss-Newton with a line search on the true cost."""
+        references = self.problem.references(t)
+        horizon = self._horizons.at(t, state.u, self.p)
+        starts = [hold] if self._plan is None else [self.condensed.clipped(self.problem.shifted(self._plan)), hold]
+        for plan in starts:
+            rollout = self.predictor.roll(state, plan, horizon, derivatives=True)
+            if rollout is not None:
+                break
+        else:
+            return Solution(Status.PREDICTION_FAILED, hold, np.inf, 0, np.inf)
+        cost = self.condensed.cost(rollout.y, references, plan, u_last)
+        status, step, iteration = Status.ITERATED, np.inf, 0
+        while iteration < count:
+            iteration += 1
+            assert rollout.dy is not None
+            found = self.condensed.direction(Linearised(rollout.y, rollout.dy, references), plan, u_last)
+            if found is None:
+                status = Status.QP_FAILED if iteration == 1 else status
+                break
+            direction, slope = found
+            step = float(np.abs(direction).max())
+            if step <= self.options.tolerance:
+                status = Status.CONVERGED
+                break
+            better = None
+            scale = 1.0
+            while better is None and scale >= _SHORTEST:
+                trial = self.condensed.clipped(plan + scale * direction)
+                rolled = self.predictor.roll(state, trial, horizon, derivatives=True)
+                if rolled is not None:
+                    trial_cost = self.condensed.cost(rolled.y, references, trial, u_last)
+                    if trial_cost <= cost + _DECREASE * scale * min(slope, 0.0):
+                        better = trial, rolled, trial_cost
+                scale /= 2
+            if better is None:
+                # No decrease can be had along a descent direction: converged to the rounding of the cost.
+                status = Status.CONVERGED if step <= np.sqrt(self.options.tolerance) else status
+                break
+            plan, rollout, cost = better
+        return Solution(status, plan, cost, iteration, step)

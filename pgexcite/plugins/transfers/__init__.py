@@ -1,0 +1,1 @@
+"""What hands the field over between the excitation system and a controller."""
