@@ -17,10 +17,11 @@ class DC1A(Exciter):
     """Amplifier and DC exciter, stabilised by the rate of the field voltage.
 
         v_t -->[ 1/(1+sT_R) ]--(-)
-        v_ref ------------------(+)-->[ (1+sT_C)/(1+sT_B) ]-->[ K_A/(1+sT_A) | V_RMIN..V_RMAX ]--(+)-->[ 1/(sT_E) ]--+--> e_fd
-        v_s, v_uel, v_oel, v_scl (+)                                                            (-)                  |
-        [ sK_F/(1+sT_F) ] ------(-)                                   [ K_E + A_EX exp(B_EX e_fd) ] <----------------+
-              ^-------------------------------------------------------------------------------------------------------
+        v_ref -----------------(+)-->[ (1+sT_C)/(1+sT_B) ]-->[ K_A/(1+sT_A) | V_RMIN..V_RMAX ]--+
+        v_s, v_uel, v_oel, v_scl (+)                                                            |
+        [ sK_F/(1+sT_F) ] -----(-)         e_fd <--+--[ 1/(sT_E) ]<--(+)------------------------+
+              ^------------------------------------+                 (-)
+                                                   +--[ K_E + A_EX exp(B_EX e_fd) ]--+
 
     The limits do not wind up. Limiters are summed at the input.
 

@@ -54,9 +54,7 @@ class HYGOV(Governor):
         error = v.n_ref - deviation - self.R * v.c
         filtered = lag(error, v.x_f, T=self.T_f)
         wanted = (v.x_f + self.T_r * (error - v.x_f) / self.T_f) / (self.r * self.T_r)
-        desired = integrator(
-            clip(wanted, -self.VELM, self.VELM, "gate speed"), v.c, lower=self.G_MIN, upper=self.G_MAX
-        )
+        desired = integrator(clip(wanted, -self.VELM, self.VELM, "gate speed"), v.c, lower=self.G_MIN, upper=self.G_MAX)
         gate = lag(desired.y, v.g, T=self.T_g)
         head = (v.q / gate.y) * (v.q / gate.y)
         flow = der(v.q, 1 - head, T=self.T_w)

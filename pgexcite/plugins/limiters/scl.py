@@ -16,8 +16,9 @@ _LOWEST_VOLTAGE = 0.1
 
 
 class SCL(TimedLimiter):
-    """Moves the voltage reference until the stator current is back at its limit: down where the machine delivers reactive power, up
-    where it takes some.
+    """Moves the voltage reference until the stator current is back at its limit.
+
+    Down where the machine delivers reactive power, up where it takes some:
 
         i_t - I_LIM --(q_e > 0)-->[ -(K_P + K_I/s) | -V_MAX..0 ]--(+)--> v_scl, summed at the regulator's input
                     --(q_e < 0)-->[  (K_P + K_I/s) |  0..V_MAX ]--(+)

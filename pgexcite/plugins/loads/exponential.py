@@ -127,7 +127,7 @@ class MultiplicativeRecovery(_Recovering):
 
         P = P_0 z_p (V/v_0)^alpha_t        T_p z_p' = (V/v_0)^alpha_s - z_p (V/v_0)^alpha_t        and alike for Q
 
-    After a step of the voltage the power recovers with the time constant ``T_p (V/v_0)^-alpha_t``. Below ``V_min`` voltages count as
+    After a step of the voltage power recovers with the time constant ``T_p (V/v_0)^-alpha_t``. Below ``V_min`` voltages count as
     ``V_min`` and the load is an admittance that goes on recovering. ``z_MIN`` and ``z_MAX`` bound what recovery can do.
 
     Not modelled: dependence on frequency.
