@@ -162,7 +162,9 @@ def _sample_points(model: Model, state: State, p: Array) -> list[tuple[Array | f
     for name, k in model.index["p"].items():
         if name.startswith("bus.") and name.endswith(".fault_status"):
             fault[k] = 1.0
-    beyond = np.concatenate((x + 1e3, z)), np.concatenate((x - 1e3, z))
+    # Only states that have a limit are moved past it: elsewhere an exponential would overflow.
+    far = np.where(model.limited, 1e3, 0.0)
+    beyond = np.concatenate((x + far, z)), np.concatenate((x - far, z))
     points: list[tuple[Array | float, ...]] = [(w, b, c, d, u, p) for c in (FROZEN, 1e-3, 0.5)]
-    points += [(beyond[0], b + 1e3, 1e-3, d, u, p), (beyond[1], b - 1e3, 1e-3, d, u, p), (w, b, 1e-3, d, u, fault)]
+    points += [(beyond[0], b + far, 1e-3, d, u, p), (beyond[1], b - far, 1e-3, d, u, p), (w, b, 1e-3, d, u, fault)]
     return points

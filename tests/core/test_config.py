@@ -216,7 +216,7 @@ WRONG = [
     ),
     (
         lambda d: d.update(controller={"c": {"model": "mpc", "unit": "G1", "backend": "nmcp"}}),
-        "controller.c",
+        "controller.c.backend",
         "did you mean 'nmpc'?",
     ),
     (lambda d: d.update(record={"sinks": ["parket"]}), "record.sinks", "did you mean 'parquet'?"),
