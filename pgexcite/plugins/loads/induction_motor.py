@@ -75,7 +75,7 @@ class InductionMotor(Load):
         return Equations(
             ode=(motion, *fluxes),
             out={"p": p, "q": q - b * square},
-            current=(-k * i_re - b * v.v_im, -k * i_im + b * v.v_re),
+            current=(-k * i_re + b * v.v_im, -k * i_im - b * v.v_re),
             # The swing equation at rest gives t_0; what is left to say of it is that the motor then draws P.
             hold={
                 "t_0": v.t_0 + self.P / v.S_n - p,

@@ -39,7 +39,7 @@ def test_first_and_next_delay_to_the_step():
     assert positions == [-1.0 - k for k in range(len(instants))]
     assert len(instants) == 5
     v = trace["bus.LV.v"]
-    assert v[trace.t == instants[-1] - H][0] < 0.98 < v[-1]
+    assert v[np.searchsorted(trace.t, instants[-1] - H - 1e-6)] < 0.98 < v[-1]
     assert trace["transformer.T1.ratio"][-1] == pytest.approx(0.95)
 
 
@@ -91,7 +91,7 @@ def test_events_block_it_and_move_its_reference():
         source(1.0, 0.94),
         ParameterStep(type="set", t=2.0, path=f"{PLACE}.blocked", value=1.0),
         ParameterStep(type="set", t=8.0, path=f"{PLACE}.blocked", value=0.0),
-        ParameterStep(type="set", t=14.5, path=f"{PLACE}.V_ref", value=0.9),
+        ParameterStep(type="set", t=14.5, path=f"{PLACE}.V_ref", value=0.92),
     ]
     instants, positions = taps(run(OLTC(T_first=5.0, T_next=2.0, half_deadband=0.02), events, 30.0))
     assert instants == [
