@@ -28,15 +28,15 @@ class Actuator:
     """Where commands go.
 
     Attributes:
-        setpoint: path of the set-point commanded.
-        feedback: path of the measured signal that says what is really in force, or ``None`` where the command always is.
+        setpoints: paths of the set-points commanded, in the problem's order.
+        feedback: paths of the measured signals that say what is really in force; empty where the commands always are.
         engaged: set-points that put the controller in charge; their opposites (0 for 1) hand back. Empty where there is nobody to
             hand back to.
-        returns: whether the set-point goes back to its initial value after control is handed back.
+        returns: whether the set-points go back to their initial values after control is handed back.
     """
 
-    setpoint: str
-    feedback: str | None
+    setpoints: tuple[str, ...]
+    feedback: tuple[str, ...] = ()
     engaged: Mapping[str, float] = field(default_factory=dict)
     returns: bool = False
 
@@ -133,8 +133,8 @@ class Ladder:
         """How old the measurement is and, until in charge, what is in force."""
         lost = not np.isfinite(list(sample.measured.values())).all()
         self._stale = self._stale + 1 if lost else 0
-        if not (sample.active and self._in_charge) and self.actuator.feedback is not None and not lost:
-            in_force = np.array([sample.measured[self.actuator.feedback]])
+        if not (sample.active and self._in_charge) and self.actuator.feedback and not lost:
+            in_force = np.array([sample.measured[path] for path in self.actuator.feedback])
             self._u = self._next = np.clip(in_force, self.problem.u_min, self.problem.u_max)
 
     # After it.
@@ -178,7 +178,10 @@ class Ladder:
             self._reused = 0
         u = self._command(self._plan[0])
         self._move, self._u = u - self._u, u
-        return Action({self.actuator.setpoint: float(u[0]), **self.actuator.engaged})
+        return Action(self._addressed(u) | dict(self.actuator.engaged))
+
+    def _addressed(self, u: Array) -> dict[str, float]:
+        return dict(zip(self.actuator.setpoints, (float(value) for value in u), strict=True))
 
     def _command(self, first: Array) -> Array:
         """What is sent now; with computing delay the plan's first move waits one sample."""
@@ -193,7 +196,7 @@ class Ladder:
             if self._reused == self.options.max_reuse + 1:
                 notes.append(f"the last command is held, for there is no classical controller: {why}")
             self._move = np.zeros_like(self._u)
-            return Action({self.actuator.setpoint: float(self._u[0])})
+            return Action(self._addressed(self._u))
         notes.append(f"hands over to the classical controller: {why}")
         self._in_charge, self._stepped_down = False, True
         self._move = np.zeros_like(self._u)
@@ -213,7 +216,7 @@ class Ladder:
             return Action(commands, release=False)
         if self.actuator.returns:
             self._u = self._next = self._returned()
-            commands[self.actuator.setpoint] = float(self._u[0])
+            commands |= self._addressed(self._u)
         return Action(commands)
 
     def _returned(self) -> Array:

@@ -104,7 +104,8 @@ def check_controller(controller: BaseModel, where: str, grid: Grid, h: float | N
                 dt,
                 f"{fitting:g} would do",
             )
-    if isinstance(unit := getattr(controller, "unit", None), str):
+    named = getattr(controller, "unit", None)
+    for unit in (named,) if isinstance(named, str) else named or ():
         collect.known("unit", unit, grid.names["unit"], f"{where}.unit")
 
 

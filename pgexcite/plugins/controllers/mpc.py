@@ -31,9 +31,9 @@ class Soft(BaseModel):
 
 
 class MPC(BaseModel):
-    """Receding-horizon control of one unit's excitation with the cost of equation (2) (see ``pgexcite.core.mpc``).
+    """Receding-horizon control of excitation with the cost of equation (2) (see ``pgexcite.core.mpc``), of one unit or of several.
 
-    Commands go to the unit's field transfer where it has one (``command = "e_fd"``: the exciter stands by, and control passes both
+    Commands go to a unit's field transfer where it has one (``command = "e_fd"``: the exciter stands by, and control passes both
     ways without a bump), else straight to a constant-field exciter, or to a regulator's set-point (``command = "v_ref"``).
 
     A plan that fails, is late, leaves its bounds or is not finite never reaches the plant: see ``pgexcite.core.ladder``.
@@ -42,7 +42,10 @@ class MPC(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     source: ClassVar[str] = '"Model Predictive Control for Field Excitation of Synchronous Generators", section 3'
 
-    unit: str = Field(description="unit whose excitation is controlled")
+    unit: str | tuple[str, ...] = Field(description="unit whose excitation is controlled, or several")
+    voltages: tuple[str, ...] = Field(
+        (), description="paths of the voltages held at V_ref; the units' terminals where left out"
+    )
     command: Literal["e_fd", "v_ref"] = Field(
         "e_fd", description="what it commands: the field voltage or the regulator's set-point"
     )
@@ -61,7 +64,7 @@ class MPC(BaseModel):
     u_max: float = par(3.2, "pu", "upper bound of the command")
     du_max: float = par(1e6, "pu", "largest move in one sample", gt=0)
     soft: tuple[Soft, ...] = Field((), description="soft bounds on outputs of the unit")
-    V_ref: float = par(0.0, "pu", "voltage reference; 0 takes the initial terminal voltage", ge=0)
+    V_ref: float = par(0.0, "pu", "voltage reference; 0 takes each voltage's initial value", ge=0)
     V_ref_known: tuple[tuple[float, float], ...] = Field(
         (), description="changes of V_ref known in advance, as [t, V_ref]"
     )
@@ -108,30 +111,47 @@ class MPC(BaseModel):
         """That of the backend."""
         return self._backend().information
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Paths of the units controlled."""
+        names = (self.unit,) if isinstance(self.unit, str) else self.unit
+        return tuple(f"unit.{name}" for name in names)
+
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """Paths of the voltages held at their references."""
+        return self.voltages or tuple(f"{unit}.v_t" for unit in self.units)
+
     def measures(self) -> Sequence[str]:
-        """The unit's own terminals: voltage, speed, powers, field voltage and current."""
-        signals = ["v_t", "omega", "p_e", "q_e", "e_fd", "i_fd"]
-        return [
-            f"unit.{self.unit}.{name}" for name in dict.fromkeys([*signals, *(bound.signal for bound in self.soft)])
-        ]
+        """The units' own terminals (voltage, speed, powers, field voltage and current), and what is tracked or bounded."""
+        signals = ("v_t", "omega", "p_e", "q_e", "e_fd", "i_fd", *(bound.signal for bound in self.soft))
+        return list(dict.fromkeys([*(f"{unit}.{name}" for unit in self.units for name in signals), *self.tracked]))
 
     def actuator(self, setpoints: Mapping[str, float]) -> Actuator:
         """Where its commands go.
 
         Raises:
-            ConfigError: the unit has no such set-point.
+            ConfigError: a unit has no such set-point.
         """
-        unit = f"unit.{self.unit}"
-        if self.command == "e_fd" and f"{unit}.transfer.e_fd_cmd" in setpoints:
-            return Actuator(
-                f"{unit}.transfer.e_fd_cmd", f"{unit}.e_fd", {f"{unit}.transfer.manual": 1.0}, returns=False
+        transferred = [f"{unit}.transfer.e_fd_cmd" in setpoints for unit in self.units]
+        if self.command == "e_fd" and all(transferred):
+            engaged = {f"{unit}.transfer.manual": 1.0 for unit in self.units}
+            commanded = tuple(f"{unit}.transfer.e_fd_cmd" for unit in self.units)
+            return Actuator(commanded, tuple(f"{unit}.e_fd" for unit in self.units), engaged)
+        name = "e_fd_ref" if self.command == "e_fd" else "v_ref"
+        paths = tuple(f"{unit}.exciter.{name}" for unit in self.units)
+        hint = (
+            'command = "e_fd" goes with the exciter "constant_field" or a transfer, command = "v_ref" with a regulator'
+        )
+        missing = [path for path in paths if path not in setpoints]
+        if missing:
+            raise ConfigError(
+                [
+                    Problem("controller.command", f"commands {path}, which does not exist", self.command, hint)
+                    for path in missing
+                ]
             )
-        path = f"{unit}.exciter.{'e_fd_ref' if self.command == 'e_fd' else 'v_ref'}"
-        if path not in setpoints:
-            text = f"commands {path}, which does not exist"
-            hint = 'command = "e_fd" goes with the exciter "constant_field" or a transfer, command = "v_ref" with a regulator'
-            raise ConfigError([Problem("controller.command", text, self.command, hint)])
-        return Actuator(path, None, {}, returns=self.command == "v_ref")
+        return Actuator(paths, returns=self.command == "v_ref")
 
     def start(self, surroundings: Surroundings, plant: Plant | None) -> Session:
         """Begin a run.
@@ -141,14 +161,18 @@ class MPC(BaseModel):
                 that does not exist.
         """
         actuator = self.actuator(surroundings.u_0)
-        u_0 = surroundings.u_0[actuator.setpoint]
-        if not self.u_min <= u_0 <= self.u_max:
-            text = (
-                f"the initial value of {actuator.setpoint} is outside u_min = {self.u_min:g} .. u_max = {self.u_max:g}"
+        u_0 = np.array([surroundings.u_0[path] for path in actuator.setpoints])
+        problems = [
+            Problem(
+                path,
+                f"its initial value is outside u_min = {self.u_min:g} .. u_max = {self.u_max:g}",
+                round(float(value), 5),
             )
-            raise ConfigError(
-                [Problem("controller", text, round(u_0, 5), "widen the bounds or move the operating point")]
-            )
+            for path, value in zip(actuator.setpoints, u_0, strict=True)
+            if not self.u_min <= value <= self.u_max
+        ]
+        if problems:
+            raise ConfigError(problems)
         problem = self._problem(actuator, surroundings)
         solver = self._backend().start(problem, surroundings, plant)
         options = LadderOptions(
@@ -159,11 +183,10 @@ class MPC(BaseModel):
             return_rate=self.v_ref_rate,
             perfect=self.information == "perfect",
         )
-        return Ladder(problem, solver, actuator, options, np.array([u_0]))
+        return Ladder(problem, solver, actuator, options, u_0)
 
     def _problem(self, actuator: Actuator, surroundings: Surroundings) -> ControlProblem:
-        unit = f"unit.{self.unit}"
-        voltage = f"{unit}.v_t"
+        n_u, n_v = len(self.units), len(self.tracked)
         known: tuple[Change, ...] = ()
         if self.disturbance_known:
             known = tuple(
@@ -173,20 +196,22 @@ class MPC(BaseModel):
             dt=self.dt,
             N_p=self.N_p,
             blocks=self.blocks or (1,) * self.N_c,
-            commands=(actuator.setpoint,),
-            voltages=(voltage,),
-            speeds=(f"{unit}.omega",),
-            Q=np.array([self.Q]),
-            P=np.array([self.P]),
-            R=np.array([self.R]),
-            u_min=np.array([self.u_min]),
-            u_max=np.array([self.u_max]),
-            du_max=np.array([self.du_max if self.du_max < 1e6 else np.inf]),
-            V_ref=np.array([self.V_ref or surroundings.y_0[voltage]]),
+            commands=actuator.setpoints,
+            voltages=self.tracked,
+            speeds=tuple(f"{unit}.omega" for unit in self.units),
+            Q=np.full(n_v, self.Q),
+            P=np.full(n_u, self.P),
+            R=np.full(n_u, self.R),
+            u_min=np.full(n_u, self.u_min),
+            u_max=np.full(n_u, self.u_max),
+            du_max=np.full(n_u, self.du_max if self.du_max < 1e6 else np.inf),
+            V_ref=np.array([self.V_ref or surroundings.y_0[path] for path in self.tracked]),
             terminal=self.terminal,
-            soft=tuple(SoftBound(f"{unit}.{s.signal}", s.lower, s.upper, s.weight) for s in self.soft),
+            soft=tuple(
+                SoftBound(f"{unit}.{s.signal}", s.lower, s.upper, s.weight) for unit in self.units for s in self.soft
+            ),
             growth=self.growth,
-            previews=tuple((t, np.array([value])) for t, value in sorted(self.V_ref_known)),
+            previews=tuple((t, np.full(n_v, value)) for t, value in sorted(self.V_ref_known)),
             known=known,
             delayed=self.delayed,
             fixed=actuator.engaged,

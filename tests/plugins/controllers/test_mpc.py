@@ -116,3 +116,67 @@ def test_refusals_name_the_place():
         MPC(unit="G2", backend="nmcp")
     with pytest.raises(ValidationError, match="max_iteration"):
         MPC(unit="G2", options={"max_iteration": 3})
+
+
+def test_soft_bound_on_the_field_current_is_kept_at_a_price():
+    """The same run with and without the bound: with it the field current stays close below it, and the voltage pays."""
+    free, bounded = run(3.0, V_ref=1.03), run(3.0, V_ref=1.03, soft=({"signal": "i_fd", "upper": 2.0, "weight": 1e3},))
+    peaks = [sim.trace()["unit.G2.i_fd"][sim.trace().t > 1.0].max() for sim in (free, bounded)]
+    assert peaks[0] > 2.1  # measured 2.235
+    assert peaks[1] < 2.08  # measured 2.021
+    assert bounded.get("unit.G2.v_t") < free.get("unit.G2.v_t") - 1e-3
+
+
+def test_a_known_disturbance_is_met_before_it_comes():
+    known, surprised = run(1.0, disturbance_known=True, N_p=6), run(1.0, N_p=6)
+    moved = [sim.trace()[COMMAND][np.searchsorted(sim.trace().t, 0.195)] for sim in (known, surprised)]
+    assert abs(moved[1] - surprised.initial.state.u[sim_index(surprised)]) < 1e-6
+    assert abs(moved[0] - moved[1]) > 0.05
+    assert known.result().controllers["mpc"].cost < surprised.result().controllers["mpc"].cost
+
+
+def sim_index(sim):
+    return sim.model.position("u", COMMAND)
+
+
+def test_a_known_change_of_reference_is_met_before_it_comes():
+    sim = Simulation(
+        kobbelv(),
+        Settings(2.0, 0.005, "tr_bdf2", "never"),
+        (),
+        {"mpc": MPC(unit="G2", N_p=10, N_c=10, V_ref_known=((1.0, 0.98),))},
+    )
+    sim.run()
+    trace = sim.trace()
+    assert trace["unit.G2.v_t"][np.searchsorted(trace.t, 0.99)] < 0.999  # under way before the change
+    assert abs(trace["unit.G2.v_t"][-1] - 0.98) < 2e-3
+
+
+def test_computing_delay_is_compensated():
+    """A plan made for one sample later loses little; the same plan sent late without knowing it would lose more."""
+    prompt, delayed = run(4.0), run(4.0, delayed=True)
+    costs = [sim.result().controllers["mpc"].cost for sim in (prompt, delayed)]
+    assert costs[0] < costs[1] < 1.01 * costs[0]  # measured 1.0043
+    trace = delayed.trace()
+    first = np.flatnonzero(np.abs(np.diff(trace[COMMAND])) > 1e-6)[0]
+    assert trace.t[first] >= 0.2 + 0.05 - 1e-9
+
+
+@pytest.mark.parametrize(
+    "options", [{"blocks": (1, 2, 3), "N_p": 8}, {"growth": 1.5, "N_p": 6, "N_c": 3}, {"terminal": 10.0}]
+)
+def test_blocks_growing_steps_and_terminal_weight_bring_the_voltage_back(options):
+    sim = run(6.0, **options)
+    assert np.abs(sim.trace()["unit.G2.v_t"][-100:] - 1.0).max() < 2e-3
+    assert sim.result().controllers["mpc"].fallbacks == 0
+
+
+def test_real_time_iteration_costs_little_against_converged_plans():
+    """Closed-loop cost over the fault run, one prepared QP a sample against every plan converged."""
+    quick, full = run(5.0), run(5.0, options={"mode": "converged", "tolerance": 1e-8, "max_iterations": 100})
+    costs = [sim.result().controllers["mpc"].cost for sim in (quick, full)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-3)  # measured 1.2e-7
+    assert (
+        sum(sim.trace()["controller.mpc.iterations"].sum() for sim in (quick,))
+        < full.trace()["controller.mpc.iterations"].sum()
+    )
