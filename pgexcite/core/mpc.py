@@ -71,6 +71,7 @@ class Problem:
         soft: soft bounds on outputs.
         growth: ratio of consecutive prediction intervals; 1 is uniform. The first is ``dt``.
         previews: known changes to come of ``V_ref``, as ``(t, V_ref)`` in order of time.
+        steps: changes of ``V_ref`` that are not known before they happen, as ``(t, V_ref)`` in order of time.
         known: known disturbances to come.
         delayed: whether a plan takes one sample to compute: it is made for the sample after the one it is made in.
         fixed: set-points that hold while the controller is in charge (the field transfer's ``manual``).
@@ -93,6 +94,7 @@ class Problem:
     soft: tuple[SoftBound, ...] = ()
     growth: float = 1.0
     previews: tuple[tuple[float, Array], ...] = ()
+    steps: tuple[tuple[float, Array], ...] = ()
     known: tuple[Change, ...] = ()
     delayed: bool = False
     fixed: Mapping[str, float] = field(default_factory=dict)
@@ -118,15 +120,21 @@ class Problem:
 
     def references(self, t: float) -> Array:
         """``V_ref`` at the end of each interval of a horizon that begins at ``t``, shape ``(N_p, len(voltages))``."""
+        now = t - self.dt if self.delayed else t
         ends = t + np.cumsum(self.intervals())
-        return np.array([self.reference_at(end) for end in ends]).reshape(self.N_p, -1)
+        return np.array([self._reference(end, now) for end in ends]).reshape(self.N_p, -1)
 
     def reference_at(self, t: float) -> Array:
-        """``V_ref`` in force at ``t``, previews included."""
-        value = self.V_ref
-        for instant, following in self.previews:
-            if instant <= t + 1e-9:
-                value = following
+        """``V_ref`` in force at ``t``."""
+        return self._reference(t, t)
+
+    def _reference(self, t: float, now: float) -> Array:
+        """``V_ref`` at ``t`` as far as it is known ``now``: the latest change of either kind holds."""
+        value, since = self.V_ref, -np.inf
+        for changes, until in ((self.previews, t), (self.steps, now)):
+            for instant, following in changes:
+                if since <= instant <= until + 1e-9:
+                    value, since = following, instant
         return value
 
     def stage_cost(self, t: float, voltages: Array, speeds: Array, move: Array) -> float:

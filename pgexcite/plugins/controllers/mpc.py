@@ -68,6 +68,9 @@ class MPC(BaseModel):
     V_ref_known: tuple[tuple[float, float], ...] = Field(
         (), description="changes of V_ref known in advance, as [t, V_ref]"
     )
+    V_ref_steps: tuple[tuple[float, float], ...] = Field(
+        (), description="changes of V_ref that are not known before they happen, as [t, V_ref]"
+    )
     disturbance_known: bool = Field(False, description="whether the events of the run are known in advance")
     delayed: bool = Field(False, description="whether a plan takes one sample to compute, and is made for the next")
     active: bool = Field(True, description="whether it is in charge from the start, or on standby")
@@ -212,6 +215,7 @@ class MPC(BaseModel):
             ),
             growth=self.growth,
             previews=tuple((t, np.full(n_v, value)) for t, value in sorted(self.V_ref_known)),
+            steps=tuple((t, np.full(n_v, value)) for t, value in sorted(self.V_ref_steps)),
             known=known,
             delayed=self.delayed,
             fixed=actuator.engaged,

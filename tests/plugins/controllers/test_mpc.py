@@ -152,6 +152,22 @@ def test_a_known_change_of_reference_is_met_before_it_comes():
     assert abs(trace["unit.G2.v_t"][-1] - 0.98) < 2e-3
 
 
+def test_an_unknown_change_of_reference_is_met_when_it_comes():
+    sim = Simulation(
+        kobbelv(),
+        Settings(2.0, 0.005, "tr_bdf2", "never"),
+        (),
+        {"mpc": MPC(unit="G2", N_p=10, N_c=10, V_ref_known=((1.5, 1.0),), V_ref_steps=((1.0, 0.98),))},
+    )
+    sim.run(until=1.4)
+    trace = sim.trace()
+    v_t = trace["unit.G2.v_t"]
+    assert np.abs(v_t[trace.t < 1.0 + 1e-9] - 1.0).max() < 1e-9
+    assert abs(v_t[np.searchsorted(trace.t, 1.2)] - 0.98) < 5e-3
+    sim.run()
+    assert abs(sim.get("unit.G2.v_t") - 1.0) < 2e-3  # the later change holds, of whichever kind
+
+
 def test_computing_delay_is_compensated():
     """A plan made for one sample later loses little; the same plan sent late without knowing it would lose more."""
     prompt, delayed = run(4.0), run(4.0, delayed=True)
