@@ -242,6 +242,27 @@ def test_a_snapshot_of_another_model_is_refused(tmp_path):
     assert not (tmp_path / "b").exists()
 
 
+def test_realtime_writes_the_record_of_a_run_and_what_it_measured(tmp_path):
+    paced = ["realtime", SMIB / "fault_nmpc.toml", "--period", "0.002", "--gc", "frozen", "--deadline", "500"]
+    out = tmp_path / "out"
+    found = figures(*paced, "--steps", "25", "--out", out)
+    assert {path.name for path in out.iterdir()} == {"config.toml", "summary.json", "trace.parquet", "run.rrd"}
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["realtime"]["steps"] == found["realtime"]["steps"] == 25
+    assert summary["t_end"] == pytest.approx(25 * 0.05)
+    assert summary["realtime"]["options"] == {"garbage": {"granted": True, "detail": "frozen"}}
+    assert "deadline_ms = 500.0" in (out / "config.toml").read_text()
+    shown = call(*paced, *SHORT[2:], "--steps", "2", "--out", out).stdout
+    assert "2 periods of 2 ms (50 ms simulated)" in shown
+
+
+def test_realtime_needs_a_controller(tmp_path):
+    result = call("realtime", SMIB / "fault_st1a.toml", "--out", tmp_path / "out")
+    assert result.exit_code == 3
+    assert "needs a controller" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_live_run_ends_without_a_viewer(tmp_path):
     result = call("run", SMIB / "fault_st1a.toml", *SHORT, "--live", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.stderr

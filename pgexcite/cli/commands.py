@@ -82,9 +82,58 @@ def run(
         show.json({"directory": str(directory), **summary})
     else:
         show.summary(scenario.title or config.stem, result.outcome.message, summary, directory)
-    ending = result.outcome.ending.value
-    if ending != scenario.expect:
-        click.echo(f"error: the run ended as {ending}, the scenario expects {scenario.expect}", err=True)
+    _exit_unless_expected(result.outcome.ending.value, scenario.expect)
+
+
+@main.command()
+@_config
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Directory of the record [runs/CONFIG].")
+@_set
+@click.option("--period", type=click.FloatRange(min=0, min_open=True), help="Wall time of a period, s [sample time].")
+@click.option("--steps", type=click.IntRange(min=1), help="Periods to run [to the end of the scenario].")
+@click.option("--deadline", type=click.FloatRange(min=0, min_open=True), help="ms; a plan later than that is not used.")
+@click.option("--priority", type=click.IntRange(1, 99), help="Run under SCHED_FIFO with this priority.")
+@click.option("--lock-memory", is_flag=True, help="Keep all pages in memory.")
+@click.option("--core", type=click.IntRange(min=0), help="Processor to stay on.")
+@click.option("--gc", "garbage", type=click.Choice(["on", "frozen", "off"]), default="on", show_default=True)
+@click.option("--keep", type=click.FloatRange(min=0), help="Simulated seconds kept in the trace [all].")
+@_json
+def realtime(
+    config: Path,
+    out: Path | None,
+    overrides: tuple[str, ...],
+    deadline: float | None,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Run a scenario by the wall clock, and measure latencies and deadline misses."""
+    from pgexcite.cli.running import execute_paced
+    from pgexcite.core.config import load
+    from pgexcite.core.realtime import RealtimeOptions
+    from pgexcite.core.record import ensure_replaceable
+    from pgexcite.core.summary import summarise
+
+    scenario = load(config, overrides)
+    if deadline is not None:
+        later = [f"controller.{name}.deadline_ms={deadline:g}" for name in scenario.controllers]
+        scenario = load(config, (*overrides, *later))
+        options["deadline"] = deadline / 1e3
+    directory = out or Path("runs") / config.stem
+    ensure_replaceable(directory)
+    chosen = RealtimeOptions(**{key: value for key, value in options.items() if value is not None})
+    result = execute_paced(scenario, directory, chosen)
+    summary = summarise(result)
+    if as_json:
+        show.json({"directory": str(directory), **summary})
+    else:
+        show.summary(scenario.title or config.stem, result.outcome.message, summary, directory)
+        show.timing(summary["realtime"])
+    _exit_unless_expected(result.outcome.ending.value, scenario.expect)
+
+
+def _exit_unless_expected(ending: str, expected: str) -> None:
+    if ending != expected:
+        click.echo(f"error: the run ended as {ending}, the scenario expects {expected}", err=True)
         click.get_current_context().exit(EXIT_OUTCOME)
 
 

@@ -15,6 +15,7 @@ import click
 
 from pgexcite.core import registry
 from pgexcite.core.config import Scenario
+from pgexcite.core.realtime import RealtimeOptions, run_paced, timed
 from pgexcite.core.record import write_record
 from pgexcite.core.result import RunResult
 from pgexcite.core.simulate import Simulation
@@ -65,6 +66,21 @@ def execute(
         simulation.run(progress=progress)
         result = simulation.result(scenario.title, scenario.resolved)
         write_record(result, directory, sinks)
+    return result
+
+
+def execute_paced(scenario: Scenario, directory: Path, options: RealtimeOptions) -> RunResult:
+    """Run a scenario by the wall clock and write its record.
+
+    Raises:
+        PgexciteError: the run cannot start or its record cannot be written.
+    """
+    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    length = options.steps * simulation.sampling * scenario.settings.h or scenario.settings.t_end
+    with _reporting(length) as report:
+        timing = run_paced(simulation, options, report)
+    result = timed(simulation.result(scenario.title, scenario.resolved), timing)
+    write_record(result, directory, [registry.find("sink", name)() for name in scenario.sinks])
     return result
 
 

@@ -62,6 +62,27 @@ def summary(title: str, message: str, figures: Mapping[str, Any], directory: Pat
     click.echo(f"{figures['steps']} steps in {figures['wall_time']:.3g} s; record: {directory}")
 
 
+def timing(figures: Mapping[str, Any]) -> None:
+    """Print what a paced run measured."""
+    phases = {key.removesuffix("_ms"): values for key, values in figures.items() if key.endswith("_ms") and values}
+    table(
+        [
+            {"ms": phase.replace("_", "-"), **{key: value for key, value in values.items() if key != "histogram"}}
+            for phase, values in phases.items()
+        ]
+    )
+    for option, found in figures["options"].items():
+        click.echo(f"{option}: {'granted' if found['granted'] else 'refused'}, {found['detail']}")
+    memory = figures["memory_mib"]
+    if memory is not None:
+        click.echo(f"resident memory {memory['start']:.1f} MiB at the start, {memory['end']:.1f} MiB at the end")
+    click.echo(
+        f"{figures['steps']} periods of {1e3 * figures['period']:g} ms ({1e3 * figures['sample']:g} ms simulated): "
+        f"{figures['missed']} deadlines of {1e3 * figures['deadline']:g} ms missed, {figures['skipped']} periods of them skipped; "
+        f"{figures['overruns']} overruns"
+    )
+
+
 def modes(rows: Sequence[Mapping[str, Any]]) -> None:
     """Print modes, each with the states that take part most."""
     table(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from pgexcite.core.system import System
+from pgexcite.core.timing import Timing
 from pgexcite.core.trace import Outcome, Trace
 
 
@@ -41,6 +42,7 @@ class RunResult:
         steps: steps taken.
         wall_time: s spent stepping, controllers included.
         controllers: statistics by name.
+        timing: measurements of a run paced by the wall clock, else ``None``.
     """
 
     title: str
@@ -51,6 +53,7 @@ class RunResult:
     steps: int
     wall_time: float
     controllers: Mapping[str, ControllerStatistics] = field(default_factory=dict)
+    timing: Timing | None = None
 
 
 class Sink(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -77,6 +78,12 @@ class Simulation:
         changes: events, in any order.
         controllers: by name.
 
+    Attributes:
+        state, p: the present point and parameters.
+        outcome: how the run ended so far; ``None`` before it began.
+        wall_time: s spent in ``run``.
+        controlled: when the controllers last began to work and when their commands were out, s of ``time.perf_counter``.
+
     Raises:
         PowerFlowError, InitialisationError, AssemblyError: there is no steady state to start from.
         ConfigError: an event or a controller refers to something that is not there.
@@ -107,6 +114,7 @@ class Simulation:
         self.p: Array = self.initial.p.copy()
         self.outcome: Outcome | None = None
         self.wall_time = 0.0
+        self.controlled = (0.0, 0.0)
         self._pending = list(self._changes)
         self._recording = _Recording()
         self._running = {name: self._start(name, controller) for name, controller in self._controllers.items()}
@@ -168,6 +176,21 @@ class Simulation:
             self.outcome = Outcome(Ending.COMPLETED, self.state.t, "", f"completed at t = {self.state.t:g} s")
         assert self.outcome is not None
         return self.outcome
+
+    @property
+    def sampling(self) -> int:
+        """Steps between two instants at which a controller may be due; 0 without controllers."""
+        return math.gcd(*(r.every for r in self._running.values()))
+
+    def forget(self, before: float) -> None:
+        """Drop recorded samples older than ``before`` (s), so that a run without end fits in memory; log and statistics stay."""
+        r = self._recording
+        gone = sum(block[-1] < before for block in r.t[:-1])
+        for blocks in (r.t, r.x, r.z, r.d, r.u, r.y):
+            del blocks[:gone]
+        for running in self._running.values():
+            old = sum(t < before for t in running.t[:-1])
+            del running.t[:old], running.diagnostics[:old]
 
     def _ended(self) -> bool:
         return self.outcome is not None and self.outcome.ending is not Ending.COMPLETED
@@ -301,8 +324,10 @@ class Simulation:
             return
         u = self.state.u.copy()
         y = self.kernel.outputs(self.state, self.p)
+        began = time.perf_counter()
         for name, running in due.items():
             self._call(name, running, y, u)
+        self.controlled = (began, time.perf_counter())
         if not np.array_equal(u, self.state.u):
             self._jump(u, self.p)
         for running in due.values():
@@ -349,7 +374,7 @@ class Simulation:
         """The run so far as a record to be written."""
         outcome = self.outcome or Outcome(Ending.COMPLETED, self.state.t, "", "not run to its end")
         controllers = {
-            name: ControllerStatistics(len(r.t), tuple(r.solve_ms), r.fallbacks, r.cost)
+            name: ControllerStatistics(len(r.solve_ms), tuple(r.solve_ms), r.fallbacks, r.cost)
             for name, r in self._running.items()
         }
         system = self.model.system

@@ -31,7 +31,10 @@ def summarise(result: RunResult) -> dict[str, Any]:
 
     Of each controller: ``samples``, ``solve_ms`` (``median``, ``p99``, ``max``; ``None`` when it never solved), ``fallbacks``,
     ``cost``.
+
+    Of a run paced by the wall clock, ``realtime``: see ``pgexcite.core.timing.Timing``.
     """
+    realtime = {} if result.timing is None else {"realtime": result.timing.summary()}
     return {
         "outcome": result.outcome.ending.value,
         "t_end": float(result.outcome.t),
@@ -39,6 +42,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "wall_time": float(result.wall_time),
         "units": {name: _unit(result, name) for name in unit_names(result.trace)},
         "controllers": {name: _controller(statistics) for name, statistics in result.controllers.items()},
+        **realtime,
     }
 
 

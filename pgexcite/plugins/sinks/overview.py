@@ -13,6 +13,7 @@ from pgexcite.core import recording
 from pgexcite.core.recording import Colour, colour, entity
 from pgexcite.core.system import Device, System
 from pgexcite.core.trace import Trace
+from pgexcite.plugins.sinks import realtime_view
 from pgexcite.plugins.sinks.capability_view import CapabilityView
 from pgexcite.plugins.sinks.single_line_view import SingleLineView
 
@@ -88,6 +89,8 @@ class Overview:
         overview = rrb.Horizontal(left, right, column_shares=[2, 3], name="Overview")
         inside = self._component_plots()
         tabs = [overview, rrb.Grid(*inside, grid_columns=2, name="Components")] if inside else [overview]
+        if any(path.startswith("realtime.") for path in self.signals):
+            tabs.append(realtime_view.tab())
         return recording.blueprint(rrb.Tabs(*tabs, active_tab=0) if len(tabs) > 1 else overview)
 
     def draw_fixed(self, stream: Any) -> None:

@@ -13,6 +13,7 @@ from pgexcite.core.record import RECORDING_FILE
 from pgexcite.core.result import RunResult
 from pgexcite.core.system import System
 from pgexcite.core.trace import Trace
+from pgexcite.plugins.sinks import realtime_view
 from pgexcite.plugins.sinks.overview import Overview
 
 
@@ -26,6 +27,8 @@ class RerunSink:
         stream = recording.new_stream(result.title, result.trace.columns)
         recording.save(stream, path, overview.blueprint())
         overview.draw_fixed(stream)
+        if result.timing is not None:
+            realtime_view.draw(stream, result.timing)
         overview.send(stream, result.trace)
         recording.finish(stream)
         return path

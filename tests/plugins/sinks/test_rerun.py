@@ -7,9 +7,11 @@ import pytest
 import rerun as rr
 
 from pgexcite.core.config import from_data, load
+from pgexcite.core.realtime import timed
 from pgexcite.core.record import read_trace, write_record
 from pgexcite.core.recording import entity
 from pgexcite.core.simulate import Simulation
+from pgexcite.core.timing import PHASES, Timing
 from pgexcite.core.trace import Trace
 from pgexcite.plugins.sinks.config import ConfigSink
 from pgexcite.plugins.sinks.overview import frames
@@ -120,3 +122,18 @@ def test_a_taken_port_is_left_to_whoever_has_it(synthetic_run):
         taken = int(one.url.split(":")[2].split("/")[0])
         with serve("two", result.system, ("unit.G2.v_t",), port=taken) as two:
             assert two.url != one.url
+
+
+def test_a_paced_run_shows_its_histograms(synthetic_run, tmp_path):
+    result = synthetic_run(mpc=True)
+    n = 100
+    ms = {phase: np.full(n, 1.0 + k) for k, phase in enumerate(PHASES)}
+    timing = Timing(0.05, 0.05, 0.05, 0.05 * np.arange(n), ms, 0, (), ())
+    path = RerunSink().write(timed(result, timing), tmp_path)
+    charts, series = {}, read_back(path)
+    for chunk in rr.chunk.RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if "BarChart:values" in batch.schema.names:
+            charts[chunk.entity_path] = batch
+    assert set(charts) == {f"/histogram/{phase}" for phase in PHASES}
+    np.testing.assert_array_equal(series["/realtime/work_ms"][2][:10], 4.0)
