@@ -33,6 +33,9 @@ FROZEN = 1e-30
 """Stage coefficient at which states cannot move: the algebraic unknowns are solved at fixed states."""
 LARGEST_WRITTEN_OUT = 1500
 """Unknowns above which factors are no longer written out and a numeric sparse LU takes every stage."""
+UPDATE_WEIGHT = 1e-12
+"""Weight of the squared Newton update against the squared residual. Where the network has no solution a small residual is not
+enough: the current of a constant power vanishes as its voltage runs away to infinity, and only the update tells."""
 _AT_BOUND = 1e-9
 
 
@@ -41,8 +44,8 @@ class StageFunctions:
     """The compiled pieces of a step.
 
     Attributes:
-        newton: ``(w, b, c, d, u, p) -> (w_next, norm2)``, one Newton iteration on ``w = (x+, z+)`` and the squared residual at
-            ``w``; ``None`` above ``LARGEST_WRITTEN_OUT`` unknowns.
+        newton: ``(w, b, c, d, u, p) -> (w_next, norm2)``, one Newton iteration on ``w = (x+, z+)``, and the squared residual at
+            ``w`` plus ``UPDATE_WEIGHT`` times the squared update; ``None`` above ``LARGEST_WRITTEN_OUT`` unknowns.
         history: ``(x, z, d, u, p, c) -> (b, mass)``.
         residual: ``(w, b, c, d, u, p) -> (r, J)`` for the numeric solver.
         update: ``(x, z, d, u, p, h) -> d_next``.
@@ -119,7 +122,9 @@ def build_stage_functions(model: Model, state: State, p: Array, stage: Stage | N
     if stage.w.numel() <= LARGEST_WRITTEN_OUT:
         lu = SymbolicLU(stage.jacobian, pairing)
         entries = lu.entries
-        newton = ca.Function("newton", arguments, [stage.w - lu.solve(stage.r), ca.sumsqr(stage.r)], {"cse": True})
+        update = lu.solve(stage.r)
+        norm2 = ca.sumsqr(stage.r) + UPDATE_WEIGHT * ca.sumsqr(update)
+        newton = ca.Function("newton", arguments, [stage.w - update, norm2], {"cse": True})
     x, z, d, u, p_ = stage.w[: len(model.x_names)], stage.w[len(model.x_names) :], stage.d, stage.u, stage.p
     h = ca.SX.sym("h")
     d_next, y = model.dae(x, z, d, u, p_, h)[5:]

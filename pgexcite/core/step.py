@@ -17,12 +17,13 @@ from scipy.sparse.linalg import splu
 from pgexcite.core.codegen import CompilationError, CompiledLoop, build, compiler, generate
 from pgexcite.core.model import Model, State
 from pgexcite.core.settings import Compile, Rule
-from pgexcite.core.stage import ALPHA, BETA, FROZEN, GAMMA, build_stage_functions
+from pgexcite.core.stage import ALPHA, BETA, FROZEN, GAMMA, UPDATE_WEIGHT, build_stage_functions
 
 Array = NDArray[np.float64]
 
 TOLERANCE = 1e-8
-"""Residual (2-norm) at which the Newton update just made is accepted; convergence is quadratic, so its own error is far below."""
+"""Residual (2-norm) at which the Newton update just made is accepted; convergence is quadratic, so its own error is far below. The
+update itself counts with ``sqrt(UPDATE_WEIGHT)``: it must be below 0.01."""
 MAX_ITERATIONS = 12
 STARTUP_STEPS = 2
 """Backward-Euler steps after a discontinuity when the rule is trapezoidal."""
@@ -273,7 +274,8 @@ class Kernel:
                 if error_trial < (1 - 0.1 * scale) * error or error_trial < TOLERANCE or scale < 1e-3:
                     break
                 scale /= 2
-            converged = error < TOLERANCE and error_trial < TOLERANCE
+            update = scale * float(np.linalg.norm(step)) * UPDATE_WEIGHT**0.5
+            converged = error < TOLERANCE and error_trial < TOLERANCE and update < TOLERANCE
             if not error_trial < error and not converged:
                 return False
             w, r, jacobian, error = trial, r_trial, jacobian_trial, error_trial
