@@ -6,8 +6,11 @@ from pgexcite.core.component import Component
 from pgexcite.core.network import Bus, Line, Transformer
 from pgexcite.core.system import Device, Schedule, System
 from pgexcite.plugins.exciters.constant import ConstantField
+from pgexcite.plugins.exciters.sexs import SEXS
 from pgexcite.plugins.exciters.st1a import ST1A
 from pgexcite.plugins.governors.constant import ConstantTorque
+from pgexcite.plugins.loads.zip import ConstantImpedance
+from pgexcite.plugins.machines.genrou import GENROU
 from pgexcite.plugins.machines.salient_pole import SalientPole
 from pgexcite.plugins.sources.infinite_bus import InfiniteBus
 from pgexcite.plugins.stabilisers.kundur import KundurPSS
@@ -44,3 +47,29 @@ def kobbelv(reference: str = "auto", S_base: float = 175.0, **slots: Component) 
 def regulated(**slots: Component) -> System:
     """The same plant under ST1A with a stabiliser."""
     return kobbelv(**(REGULATED | slots))
+
+
+def two_units(reference: str = "auto", *, grid: bool = True, load: Component | None = None) -> System:
+    """A round-rotor and a salient-pole unit that feed a load, and an infinite bus over two lines where ``grid``.
+
+    Without the infinite bus the first unit is the slack of the power flow.
+    """
+    ends = {"L1": ("A", "L"), "L2": ("B", "L")} | ({"L3": ("L", "INF"), "L4": ("L", "INF")} if grid else {})
+    demand = load or ConstantImpedance(P=150.0, Q=30.0)
+    first: dict[str, Component] = {"machine": GENROU(), "exciter": SEXS(), "governor": ConstantTorque()}
+    second: dict[str, Component] = {"machine": SalientPole(), "exciter": ST1A(K_A=50.0), "governor": ConstantTorque()}
+    devices = [
+        Device("unit.G1", "A", 100.0, first, Schedule(P=70.0, V=1.02) if grid else Schedule(V=1.02, angle=0.0)),
+        Device("unit.G2", "B", 175.0, second, Schedule(P=90.0, V=1.01)),
+        Device("load.L", "L", 100.0, {"": demand}, Schedule(P=-150.0, Q=-30.0)),
+    ]
+    if grid:
+        devices.append(Device("infinite_bus.grid", "INF", 100.0, {"": InfiniteBus()}, Schedule(V=1.0, angle=0.0)))
+    return System(
+        S_base=100.0,
+        f_n=50.0,
+        buses={name: Bus() for name in ("A", "B", "L", *(["INF"] if grid else []))},
+        lines={name: Line(**{"from": a, "to": b}, R=0.01, X=0.1, B=0.02) for name, (a, b) in ends.items()},
+        devices=tuple(devices),
+        reference=reference,
+    )

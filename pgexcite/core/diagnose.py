@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 _NEARLY_SINGULAR = 0.05
 """Smallest singular value of the algebraic equations, against its value at the start of the run, that counts as singular."""
+_DEVICES = 1e-12
+"""Weight of devices' own unknowns against voltages in telling which bus is to blame."""
 
 
 def algebraic_jacobian(kernel: Kernel, state: State, p: Array) -> Array:
@@ -59,12 +61,17 @@ def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healt
 
 
 def _weakest_bus(model: Model, direction: Array) -> str:
-    """The bus whose voltage moves most in the direction the equations no longer determine."""
-    size: dict[str, float] = {}
+    """The bus whose voltage moves most in the direction the equations no longer determine.
+
+    Where no voltage moves at all it is the bus of the device that no longer determines something: a source short-circuited by a
+    bolted fault at its own bus.
+    """
+    size = dict.fromkeys(model.system.buses, 0.0)
+    buses = {f"bus.{name}": name for name in model.system.buses}
+    buses |= {d.component_path(slot): d.bus for d in model.system.devices for slot in d.components}
     for path, component in zip(model.z_names, direction, strict=True):
-        if path.startswith("bus."):
-            name = path.removeprefix("bus.").rpartition(".")[0]
-            size[name] = size.get(name, 0.0) + component * component
+        owner = path.rpartition(".")[0]
+        size[buses[owner]] += component * component * (1.0 if owner.startswith("bus.") else _DEVICES)
     return max(size, key=lambda name: size[name])
 
 
