@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pgexcite.core.events import Change
 from pgexcite.core.measurement import Measurement
 from pgexcite.core.model import Model, State
-from pgexcite.core.settings import Rule
+from pgexcite.core.settings import Compile, Rule
 from pgexcite.core.step import Kernel
 from pgexcite.core.system import System
 
@@ -30,6 +30,7 @@ class Surroundings:
         y_0: outputs at the initial point, by path.
         system: the grid as configured, for controllers that build a model of their own from its nameplate data.
         changes: the events of the run, for controllers that declare some of them known.
+        compile: whether steps are compiled to C, for such models too.
     """
 
     h: float
@@ -38,6 +39,7 @@ class Surroundings:
     y_0: Mapping[str, float]
     system: System
     changes: tuple[Change, ...] = ()
+    compile: Compile = "auto"
 
 
 @dataclass(frozen=True)

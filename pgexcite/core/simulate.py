@@ -306,6 +306,7 @@ class Simulation:
             y_0=dict(zip(self.model.y_names, y, strict=True)),
             system=self.model.system,
             changes=tuple(self._changes),
+            compile=self.settings.compile,
         )
         plant = None
         if controller.information == "perfect":
