@@ -36,8 +36,9 @@ def draw(stream: Any, timing: Timing) -> None:
         recording.style(stream, entity(signal(phase)), phase.replace("_", "-"), colour(k))
         if timing.ms[phase].size:
             edges, counts = histogram(timing.ms[phase])
-            middles = np.log10(edges[:-1] * edges[1:]) / 2
-            chart = rr.BarChart(counts, color=colour(k), abscissa=middles)
+            exponents = np.log10(edges)
+            middles, widths = (exponents[:-1] + exponents[1:]) / 2, np.diff(exponents)
+            chart = rr.BarChart(counts, color=colour(k), abscissa=middles, widths=widths)
             stream.log(_bars(phase), chart, static=True)
 
 
