@@ -251,6 +251,48 @@ def equal_area(config: Path, overrides: tuple[str, ...], figure: Path | None, as
 
 
 @main.command()
+@_config
+@_set
+@click.option("--load", "loads", multiple=True, metavar="NAME", help="A load to scale; may be repeated [all].")
+@click.option("--tan-phi", "tangents", multiple=True, type=float, help="Q/P given to these loads; may be repeated [own].")
+@click.option("--bus", help="Bus whose voltage is drawn [the weakest].")
+@click.option("--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw the curves into this file.")
+@_json
+def pv(
+    config: Path,
+    overrides: tuple[str, ...],
+    loads: tuple[str, ...],
+    tangents: tuple[float, ...],
+    bus: str | None,
+    figure: Path | None,
+    as_json: bool,
+) -> None:
+    """P-V curve: loads scaled at constant power factor, through the nose.
+
+    Three values of --tan-phi or more also draw the surface they span over P and Q.
+    """
+    from pgexcite.core.config import load
+    from pgexcite.studies.pv import pv_curve
+
+    scenario = load(config, overrides)
+    if bus is not None and bus not in scenario.system.buses:
+        raise click.BadParameter(f"there is no bus {bus}; buses are {', '.join(scenario.system.buses)}", param_hint="--bus")
+    curves = [
+        ("own power factor" if tangent is None else f"tan φ = {tangent:g}", pv_curve(scenario.system, loads, tangent))
+        for tangent in (tangents or (None,))
+    ]
+    shown = bus or curves[0][1].weakest
+    if figure is not None:
+        from pgexcite.studies.pv_figure import draw_pv
+
+        draw_pv(curves, shown, figure, scenario.title or config.stem)
+    if as_json:
+        show.json({"curves": [{"label": label, **curve.as_dict()} for label, curve in curves]})
+    else:
+        show.table([curve.row(label, shown) for label, curve in curves])
+
+
+@main.command()
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path, file_okay=False))
 @click.option(
     "--out", type=click.Path(path_type=Path, file_okay=False), help="Where picture and recording go [runs/compare]."

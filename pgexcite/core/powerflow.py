@@ -71,8 +71,14 @@ def _numbers(element: Branch | Shunt) -> dict[str, float]:
 
 
 @dataclass
-class _Buses:
-    """What each bus holds; NaN marks an unknown V or angle and a free P or Q."""
+class Buses:
+    """What each bus holds, in the order of the system's buses; NaN marks an unknown V or angle and a free P or Q.
+
+    Attributes:
+        P, Q: delivered to the bus by its devices, pu of the system base.
+        V: magnitude, pu.
+        angle: rad.
+    """
 
     P: Real
     Q: Real
@@ -93,7 +99,7 @@ def solve(system: System) -> PowerFlow:
     iterations = 0
     y = admittance_matrix(system)
     for _ in range(_MAX_LIMIT_ROUNDS):
-        buses = _specification(system, index, held)
+        buses = specification(system, index, held)
         _check_count(buses, names)
         v, used = _newton(y, buses, names, system.S_base)
         iterations += used
@@ -136,9 +142,10 @@ def _check_islands(system: System) -> None:
         raise PowerFlowError(problems)
 
 
-def _specification(system: System, index: Mapping[str, int], held: Mapping[str, float]) -> _Buses:
+def specification(system: System, index: Mapping[str, int], held: Mapping[str, float]) -> Buses:
+    """What every bus holds, pu of the system base; ``held`` are devices at a reactive limit, with that limit in Mvar."""
     n = len(index)
-    buses = _Buses(np.zeros(n), np.zeros(n), np.full(n, np.nan), np.full(n, np.nan))
+    buses = Buses(np.zeros(n), np.zeros(n), np.full(n, np.nan), np.full(n, np.nan))
     for device in system.devices:
         k, plan = index[device.bus], device.schedule
         reactive = held.get(device.path, plan.Q)
@@ -155,7 +162,7 @@ def _specification(system: System, index: Mapping[str, int], held: Mapping[str, 
     return buses
 
 
-def _check_count(buses: _Buses, names: list[str]) -> None:
+def _check_count(buses: Buses, names: list[str]) -> None:
     rows = int(np.sum(~np.isnan(buses.P)) + np.sum(~np.isnan(buses.Q)))
     unknowns = int(np.sum(np.isnan(buses.V)) + np.sum(np.isnan(buses.angle)))
     if rows == unknowns:
@@ -174,7 +181,7 @@ def _check_count(buses: _Buses, names: list[str]) -> None:
     raise PowerFlowError(problems)
 
 
-def _newton(y: sp.csr_matrix, buses: _Buses, names: list[str], base: float) -> tuple[Complex, int]:
+def _newton(y: sp.csr_matrix, buses: Buses, names: list[str], base: float) -> tuple[Complex, int]:
     P_rows, Q_rows = np.flatnonzero(~np.isnan(buses.P)), np.flatnonzero(~np.isnan(buses.Q))
     a_cols, V_cols = np.flatnonzero(np.isnan(buses.angle)), np.flatnonzero(np.isnan(buses.V))
     slack = np.nanmean(buses.angle) if np.any(~np.isnan(buses.angle)) else 0.0
@@ -192,7 +199,7 @@ def _newton(y: sp.csr_matrix, buses: _Buses, names: list[str], base: float) -> t
     for iteration in range(_MAX_ITERATIONS):
         if best <= _TOLERANCE:
             return v, iteration
-        ds_da, ds_dV = _derivatives(y, v, V)
+        ds_da, ds_dV = derivatives(y, v, V)
         jacobian = sp.bmat(
             [
                 [ds_da.real[P_rows][:, a_cols], ds_dV.real[P_rows][:, V_cols]],
@@ -224,7 +231,7 @@ def _newton(y: sp.csr_matrix, buses: _Buses, names: list[str], base: float) -> t
     raise _failure(dP, dQ, P_rows, Q_rows, V, names, base, "no voltage satisfies the schedule")
 
 
-def _derivatives(y: sp.csr_matrix, v: Complex, V: Real) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+def derivatives(y: sp.csr_matrix, v: Complex, V: Real) -> tuple[sp.csr_matrix, sp.csr_matrix]:
     """``dS/d angle`` and ``dS/d|V|`` of the bus injections."""
     current = sp.diags(np.conj(y @ v))
     diag_v, unit = sp.diags(v), sp.diags(v / V)
