@@ -16,7 +16,7 @@ from pgexcite.core.recording import Colour, colour, entity
 from pgexcite.core.summary import unit_names
 from pgexcite.core.trace import Trace
 from pgexcite.studies.figures import PANELS, draw_runs
-from pgexcite.studies.measures import first_swing_max, recovery_time, swing_damping
+from pgexcite.studies.measures import swing_figures
 
 PICTURE_FILE = "compare.png"
 RECORDING_FILE = "compare.rrd"
@@ -32,8 +32,7 @@ class Comparison:
 
     Attributes:
         rows: one per run and unit: ``label``, ``unit``, ``outcome``, ``t_end``, the unit's figures of ``summary.json``, then
-            ``first_swing_deg``, ``recovery_5`` and ``recovery_1`` [s after the last event], ``damping`` (of the swing), and over
-            all controllers of the run ``fallbacks`` and the largest ``solve_ms_p99``.
+            those of ``measures.swing_figures``, and over all controllers of the run ``fallbacks`` and the largest ``solve_ms_p99``.
         picture: the PNG.
         recording: the ``.rrd``.
     """
@@ -152,7 +151,6 @@ def _title(records: Sequence[Record]) -> str:
 
 
 def _row(label: str, record: Record, unit: str) -> dict[str, Any]:
-    has = record.trace.signals(f"unit.{unit}")
     controllers = record.summary["controllers"].values()
     solved = [item["solve_ms"]["p99"] for item in controllers if item["solve_ms"]]
     return {
@@ -161,10 +159,7 @@ def _row(label: str, record: Record, unit: str) -> dict[str, Any]:
         "outcome": record.summary["outcome"],
         "t_end": record.summary["t_end"],
         **record.summary["units"][unit],
-        "first_swing_deg": first_swing_max(record.trace, unit) if "delta" in has else None,
-        "recovery_5": recovery_time(record.trace, unit, 0.05) if "v_t" in has else None,
-        "recovery_1": recovery_time(record.trace, unit, 0.01) if "v_t" in has else None,
-        "damping": swing_damping(record.trace, unit) if "delta" in has else None,
+        **swing_figures(record.trace, unit),
         "solve_ms_p99": max(solved, default=None),
         "fallbacks": sum(item["fallbacks"] for item in controllers),
     }

@@ -16,6 +16,27 @@ _FADED = 0.1
 """A swing below this part of the first one is no longer measured: the ratio of two small numbers says little."""
 
 
+def swing_figures(trace: Trace, unit: str) -> dict[str, float | None]:
+    """All figures of this module for a unit, by name; ``None`` where one cannot be had.
+
+    ``first_swing_deg``, ``recovery_5`` and ``recovery_1`` [s], ``damping`` and ``control_energy`` [pu^2 s].
+    """
+    has = trace.signals(f"unit.{unit}")
+    return {
+        "first_swing_deg": first_swing_max(trace, unit) if "delta" in has else None,
+        "recovery_5": recovery_time(trace, unit, 0.05) if "v_t" in has else None,
+        "recovery_1": recovery_time(trace, unit, 0.01) if "v_t" in has else None,
+        "damping": swing_damping(trace, unit) if "delta" in has else None,
+        "control_energy": control_energy(trace, unit) if "e_fd" in has else None,
+    }
+
+
+def control_energy(trace: Trace, unit: str) -> float:
+    """Integral of the squared deviation of the field voltage from its initial value, pu^2 s."""
+    e_fd = trace[f"unit.{unit}.e_fd"]
+    return float(np.trapezoid((e_fd - e_fd[0]) ** 2, trace.t))
+
+
 def first_swing_max(trace: Trace, unit: str) -> float | None:
     """Rotor angle at the first crest behind the first event, degrees; ``None`` when there is none (synchronism is lost)."""
     events = event_times(trace)
