@@ -6,6 +6,9 @@
     up        after ``recover_after`` good plans in a row control is taken back from level 2
 
 Every step down and up is in the log; the summary counts the samples in which a plan could not be used.
+
+What it cannot see: a plan within its bounds, of finite cost, that is nevertheless wrong. Two seconds of random field voltages can
+cost a machine its synchronism.
 """
 
 from __future__ import annotations
@@ -148,6 +151,8 @@ class Ladder:
             return solution.status.value
         if not np.isfinite(solution.u).all():
             return "the plan is not finite"
+        if not np.isfinite(solution.cost):
+            return "the plan's predicted cost is not finite"
         slack = 1e-9
         if (solution.u < self.problem.u_min - slack).any() or (solution.u > self.problem.u_max + slack).any():
             return "the plan leaves its bounds"

@@ -154,7 +154,8 @@ class Shooting(ABC):
 
     def _from_state(self, state: State | None, t: float, u_last: Array) -> Solution:
         hold = self.condensed.clipped(np.tile(u_last, (self.problem.N_c, 1)))
-        if state is None:
+        if state is None or not _finite(state, self.p):
+            self._from = None
             return Solution(Status.STATE_UNKNOWN, hold, np.inf, 0, np.inf)
         if self.problem.delayed:
             later = self._advance(state, t, u_last)
@@ -254,3 +255,7 @@ class Shooting(ABC):
                 break
             plan, rollout, cost = better
         return Solution(status, plan, cost, iteration, step)
+
+
+def _finite(state: State, p: Array) -> bool:
+    return all(bool(np.isfinite(values).all()) for values in (state.x, state.z, state.d, state.u, p))
