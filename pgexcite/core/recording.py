@@ -141,17 +141,49 @@ def send_log(stream: Any, path: str, log: Sequence[LogEntry], t: Array, label: s
     stream.send_columns(path, [rr.TimeColumn("time", duration=at), rr.TimeColumn("step", sequence=steps)], columns)
 
 
-def plot(name: str, contents: Sequence[str], legend: str = "RightTop") -> Any:
-    """A time-series view, its time axis linked to that of every other; ``legend`` is the corner the curves leave free."""
+Spans = Mapping[str, tuple[float, float]]
+"""Smallest and largest finite sample of each entity."""
+
+
+def plot(name: str, contents: Sequence[str], legend: str = "RightTop", spans: Spans | None = None) -> Any:
+    """A time-series view, its time axis linked to that of every other.
+
+    Args:
+        name: its title.
+        contents: entities of its series.
+        legend: the corner the curves leave free.
+        spans: of its series, for a vertical axis that stands from the first frame on; the viewer finds one where it is left out.
+    """
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
         origin="/",
         contents=[*contents],
         name=name,
+        axis_y=_axis([(spans or {})[path] for path in contents if path in (spans or {})]),
         axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.auto(legend)),
     )
+
+
+def spans_of(columns: Mapping[str, Array]) -> Spans:
+    """Spans of these entities; one without a finite sample has none."""
+    found = {}
+    for path, samples in columns.items():
+        finite = samples[np.isfinite(samples)]
+        if finite.size:
+            found[path] = float(finite.min()), float(finite.max())
+    return found
+
+
+def _axis(spans: Sequence[tuple[float, float]]) -> Any:
+    import rerun.blueprint as rrb
+
+    if not spans:
+        return None
+    low, high = min(low for low, _ in spans), max(high for _, high in spans)
+    room = 0.06 * (high - low) or 0.05 * max(abs(high), 1e-3)
+    return rrb.ScalarAxis(range=(low - room, high + room))
 
 
 def text_log(name: str, contents: Sequence[str]) -> Any:

@@ -14,7 +14,7 @@ from pgexcite.core.errors import PgexciteError
 from pgexcite.core.record import Record, read_record
 from pgexcite.core.recording import Colour, colour, entity
 from pgexcite.core.summary import unit_names
-from pgexcite.core.trace import Trace
+from pgexcite.core.trace import Array, Trace
 from pgexcite.studies.figures import PANELS, draw_runs
 from pgexcite.studies.measures import swing_figures
 
@@ -86,10 +86,14 @@ def overlay(runs: Mapping[str, Trace], units: Sequence[str], path: Path, title: 
         "delta": "rotor angle δ [deg]",
         "omega": "rotor speed ω [pu]",
     }
+    samples = {label: _samples(label, trace, units) for label, trace in runs.items()}
+    spans = recording.spans_of({path: values for columns in samples.values() for path, values in columns.items()})
     columns = [
         rrb.Vertical(
             *(
-                recording.plot(f"{unit}: {titles[signal]}", [where for where, _, _ in curves[unit, signal]])
+                recording.plot(
+                    f"{unit}: {titles[signal]}", [where for where, _, _ in curves[unit, signal]], spans=spans
+                )
                 for signal, _, _ in PANELS
                 if (unit, signal) in curves
             ),
@@ -104,14 +108,19 @@ def overlay(runs: Mapping[str, Trace], units: Sequence[str], path: Path, title: 
         for where, name, rgb in series:
             recording.style(stream, where, name, rgb)
     for label, trace in runs.items():
-        samples = {entity(signal, "runs", label): values for signal, values in trace.columns.items()}
-        for unit in units:
-            if f"unit.{unit}.delta" in trace.columns:
-                samples[_entity(label, unit, "delta")] = np.degrees(trace[f"unit.{unit}.delta"])
-        recording.send_scalars(stream, samples, trace.t)
+        recording.send_scalars(stream, samples[label], trace.t)
         recording.send_log(stream, recording.entity_of("log", label), trace.log, trace.t, label=f"{label}: ")
     recording.finish(stream)
     return path
+
+
+def _samples(label: str, trace: Trace, units: Sequence[str]) -> dict[str, Array]:
+    """Samples of a run by entity, rotor angles also in degrees."""
+    samples = {entity(signal, "runs", label): values for signal, values in trace.columns.items()}
+    for unit in units:
+        if f"unit.{unit}.delta" in trace.columns:
+            samples[_entity(label, unit, "delta")] = np.degrees(trace[f"unit.{unit}.delta"])
+    return samples
 
 
 def _entity(label: str, unit: str, signal: str) -> str:

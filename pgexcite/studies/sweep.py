@@ -120,7 +120,7 @@ def cases(path: Path) -> tuple[str, list[Case]]:
         ) from error
     found: list[Case] = []
     problems: list[Problem] = []
-    for factor in (Factor(name=NOMINAL), *study.factor):
+    for factor in (Factor.model_validate({"name": NOMINAL}), *study.factor):
         unknown = set(factor.only) - set(study.variant)
         problems += [Problem(f"factor.{factor.name}.only", f"there is no variant {name!r}") for name in sorted(unknown)]
         for name, variant in study.variant.items():

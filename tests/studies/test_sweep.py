@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -88,7 +89,7 @@ def die_in_one_case(case):
 
 def test_a_dying_worker_costs_one_case(study_file, tmp_path, monkeypatch):
     monkeypatch.setattr(sweep, "run_case", die_in_one_case)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
     found = sweep.run_study(study_file, tmp_path / "out", workers=2)
     errors = [(row["variant"], row["factor"]) for row in found.rows if "error" in row]
     assert errors == [("st1a", "longer line")]

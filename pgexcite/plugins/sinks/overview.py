@@ -12,7 +12,7 @@ import numpy as np
 from pgexcite.core import recording
 from pgexcite.core.recording import Colour, colour, entity
 from pgexcite.core.system import Device, System
-from pgexcite.core.trace import Trace
+from pgexcite.core.trace import Array, Trace
 from pgexcite.plugins.sinks import realtime_view
 from pgexcite.plugins.sinks.capability_view import CapabilityView
 from pgexcite.plugins.sinks.single_line_view import SingleLineView
@@ -74,20 +74,25 @@ class Overview:
     def single_line(self) -> SingleLineView:
         return SingleLineView(self.system, self.signals)
 
-    def blueprint(self) -> Any:
-        """The layout: grid on the left, curves on the right, log below, components on a second tab."""
+    def blueprint(self, trace: Trace | None = None) -> Any:
+        """The layout: grid on the left, curves on the right, log below, components on a second tab.
+
+        Args:
+            trace: fixes the axes of the curves, where it is there already.
+        """
         import rerun.blueprint as rrb
 
+        spans = {} if trace is None else recording.spans_of(self._columns(trace))
         curves = [
-            recording.plot(quantity.title, [path for path, _, _ in series], quantity.legend)
+            recording.plot(quantity.title, [path for path, _, _ in series], quantity.legend, spans)
             for quantity, series in self._curves()
-        ] + self._diagnostics()
+        ] + self._diagnostics(spans)
         shares = [self.single_line.share(), *[1.0 for _ in self.capability.units[:1]]]
         left = rrb.Vertical(self.single_line.view(), *self.capability.views(), row_shares=shares)
         log = recording.text_log("Events", [LOG])
         right = rrb.Vertical(rrb.Grid(*curves, grid_columns=2), log, row_shares=[5, 1])
         overview = rrb.Horizontal(left, right, column_shares=[2, 3], name="Overview")
-        inside = self._component_plots()
+        inside = self._component_plots(spans)
         tabs = [overview, rrb.Grid(*inside, grid_columns=2, name="Components")] if inside else [overview]
         if any(path.startswith("realtime.") for path in self.signals):
             tabs.append(realtime_view.tab())
@@ -107,16 +112,20 @@ class Overview:
 
     def send(self, stream: Any, trace: Trace, first: int = 0) -> None:
         """Send samples; ``first`` is the index of the first one in the whole run."""
+        recording.send_scalars(stream, self._columns(trace), trace.t, first)
+        recording.send_log(stream, LOG, trace.log, trace.t)
+        shown = frames(trace)
+        self.single_line.send(stream, trace, shown, first)
+        self.capability.send(stream, trace, shown, first)
+
+    def _columns(self, trace: Trace) -> dict[str, Array]:
+        """Samples by entity, rotor angles also in degrees."""
         columns = {entity(path): samples for path, samples in trace.columns.items()}
         for device in self.units:
             path = f"{device.path}.delta"
             if path in trace.columns:
                 columns[entity(path, DEGREES)] = np.degrees(trace[path])
-        recording.send_scalars(stream, columns, trace.t, first)
-        recording.send_log(stream, LOG, trace.log, trace.t)
-        shown = frames(trace)
-        self.single_line.send(stream, trace, shown, first)
-        self.capability.send(stream, trace, shown, first)
+        return columns
 
     def _curves(self) -> list[tuple[Quantity, list[tuple[str, str, Colour]]]]:
         """The plots with anything in them, each with (entity, name, colour) of its series."""
@@ -137,22 +146,22 @@ class Overview:
             found.append((BUSES, [(entity(f"bus.{bus}.v"), bus, colour(k)) for k, bus in enumerate(buses)]))
         return found
 
-    def _diagnostics(self) -> list[Any]:
+    def _diagnostics(self, spans: recording.Spans) -> list[Any]:
         found = sorted(path for path in self.signals if path.startswith("controller."))
         return [
-            recording.plot(f"Controllers: {title}", [entity(path) for path in paths])
+            recording.plot(f"Controllers: {title}", [entity(path) for path in paths], spans=spans)
             for name, title in DIAGNOSTICS.items()
             if (paths := [path for path in found if path.endswith(name)])
         ]
 
-    def _component_plots(self) -> list[Any]:
+    def _component_plots(self, spans: recording.Spans) -> list[Any]:
         """A plot per component of a unit and per controller: states, set-points, everything a person may want to look into."""
         slots: dict[str, list[str]] = {}
         for path in sorted(self.signals):
             slot = path.rpartition(".")[0]
             if (slot.startswith("unit.") and slot.count(".") == 2) or slot.startswith("controller."):
                 slots.setdefault(slot, []).append(entity(path))
-        return [recording.plot(" ".join(slot.split(".")[1:]), paths) for slot, paths in slots.items()]
+        return [recording.plot(" ".join(slot.split(".")[1:]), paths, spans=spans) for slot, paths in slots.items()]
 
 
 def frames(trace: Trace, spacing: float = 0.02) -> np.ndarray[Any, np.dtype[np.int64]]:

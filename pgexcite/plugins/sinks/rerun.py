@@ -25,7 +25,7 @@ class RerunSink:
         path = directory / RECORDING_FILE
         overview = Overview.of(result.system, result.trace.columns)
         stream = recording.new_stream(result.title, result.trace.columns)
-        recording.save(stream, path, overview.blueprint())
+        recording.save(stream, path, overview.blueprint(result.trace))
         overview.draw_fixed(stream)
         if result.timing is not None:
             realtime_view.draw(stream, result.timing)
