@@ -97,6 +97,7 @@ class Ladder:
             "predicted_cost": solution.cost,
             "iterations": float(solution.iterations),
             "converged": float(solution.status is Status.CONVERGED),
+            "solve_ms": elapsed,
             **{f"{phase}_ms": value for phase, value in solution.times_ms.items()},
             **solution.diagnostics,
         }
