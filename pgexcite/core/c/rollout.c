@@ -1,0 +1,143 @@
+/* Predictions with exact sensitivities: the loop of pgexcite.core.prediction, operation by operation. Goes below step.c.
+
+   Expects stage_sensitivity, history_sensitivity and output_sensitivity. */
+
+static double S[N_W * N_COLUMNS], S_next[N_W * N_COLUMNS], S_b[AT_LEAST_1(N_X) * N_COLUMNS], S_c[N_COMMANDS * N_COLUMNS];
+
+static void sense_history(Stage *s, const double *x, const double *z) {
+    args[0] = x; args[1] = z; args[2] = s->d; args[3] = s->u; args[4] = s->p; args[5] = &s->c; args[6] = S; args[7] = S_c;
+    results[0] = S_b;
+    history_sensitivity(args, results, iwork, work, 0);
+}
+
+static void sense_stage(Stage *s, const double *w, const double *b, double *to) {
+    args[0] = w; args[1] = b; args[2] = &s->c; args[3] = s->d; args[4] = s->u; args[5] = s->p; args[6] = S_b; args[7] = S_c;
+    results[0] = to;
+    stage_sensitivity(args, results, iwork, work, 0);
+}
+
+static void scale_by_mass(Stage *s, double alpha, const double *A, double beta, const double *B) {
+    int i, k;
+    for (k = 0; k < N_COLUMNS; k++)
+        for (i = 0; i < N_X; i++) S_b[k * N_X + i] = s->mass[i] * (alpha * A[k * N_W + i] - beta * B[k * N_W + i]);
+}
+
+static void sense_step(Stage *s, int rule, int euler) {
+    if (rule == 2 || euler) {
+        scale_by_mass(s, 1, S, 0, S);
+        sense_stage(s, s->w[0], s->b, S);
+    } else {
+        sense_history(s, s->start, s->start + N_X);
+        if (rule == 1) {
+            sense_stage(s, s->w[0], s->b, S);
+        } else {
+            sense_stage(s, s->middle, s->b_middle, S_next);
+            scale_by_mass(s, ALPHA, S_next, BETA, S);
+            sense_stage(s, s->w[0], s->b, S);
+        }
+    }
+}
+
+static void sense_settling(Stage *s, const double *x, const double *z) {
+    int i;
+    memcpy(s->start, x, sizeof(double) * N_X); memcpy(s->start + N_X, z, sizeof(double) * N_Z);
+    s->c = FROZEN;
+    for (i = 0; i < N_X; i++) s->b[i] = s->mass[i] * x[i];
+    scale_by_mass(s, 1, S, 0, S);
+    sense_stage(s, s->start, s->b, S);
+}
+
+/* Directions of the sensitivities at the start of a piece: the commands of its move; of a sample also, if transitions are wanted,
+   each state by itself. */
+static void point_at(int move, int fresh_sample) {
+    int i;
+    if (TRANSITION && !fresh_sample) return;
+    memset(S_c, 0, sizeof S_c);
+    if (TRANSITION) {
+        memset(S, 0, sizeof S);
+        for (i = 0; i < N_X; i++) S[i * N_W + i] = 1;
+        for (i = 0; i < N_COMMANDS; i++) S_c[(N_X + i) * N_COMMANDS + i] = 1;
+    } else {
+        for (i = 0; i < N_COMMANDS; i++) S_c[(move * N_COMMANDS + i) * N_COMMANDS + i] = 1;
+    }
+}
+
+/* Rolls out N pieces of count[j] steps of length h[j] under moves[move[j]], parameters and other commands of row[j]; outputs and
+   derivatives after each piece that ends a sample. Returns how many pieces were completed. */
+PGEXCITE_PUBLIC int pgexcite_rollout(int rule, int N, const int *count, const double *h, const int *move, const int *row,
+                                     const int *end, const int *commands, int startup, double *x, double *z, double *d,
+                                     const double *p_rows, const double *u_rows, const double *moves, int derivatives, double *y,
+                                     double *dy, double *dx) {
+    static Stage s;
+    static double u[AT_LEAST_1(N_U)], u_last[AT_LEAST_1(N_U)];
+    int j, i, k, sample = 0, fresh = 1;
+    memcpy(u_last, u_rows, sizeof(double) * N_U);
+    s.d = d; s.u = u_last; s.p = p_rows; s.c = 0;
+    history_at(&s, x, z);
+    memset(S, 0, sizeof S); memset(S_c, 0, sizeof S_c);
+    for (j = 0; j < N; j++) {
+        int changed = j > 0 && row[j] != row[j - 1];
+        memcpy(u, u_rows + (long)row[j] * N_U, sizeof(double) * N_U);
+        for (i = 0; i < N_COMMANDS; i++) u[commands[i]] = moves[move[j] * N_COMMANDS + i];
+        for (i = 0; i < N_U; i++) changed |= u[i] != u_last[i];
+        s.u = u; s.p = p_rows + (long)row[j] * N_P;
+        if (changed) {
+            s.c = 0;
+            history_at(&s, x, z);
+            if (!settle(&s, x, z)) return j;
+            startup = STARTUP_STEPS;
+            memcpy(u_last, u, sizeof(double) * N_U);
+        }
+        if (derivatives && (fresh || changed)) {
+            point_at(move[j], fresh);
+            sense_settling(&s, x, z);
+        }
+        for (k = 0; k < count[j]; k++) {
+            int euler = rule == 1 && startup > 0;
+            if (!one_step(&s, rule, h[j], startup, x, z)) return j;
+            if (derivatives) sense_step(&s, rule, euler);
+            if (startup > 0) startup--;
+            if (N_D > 0 && renew(&s, h[j], x, z, d)) {
+                startup = STARTUP_STEPS;
+                if (derivatives) sense_settling(&s, x, z);
+            }
+        }
+        fresh = end[j];
+        if (!end[j]) continue;
+        args[0] = x; args[1] = z; args[2] = d; args[3] = u; args[4] = s.p; args[5] = S; args[6] = S_c;
+        results[0] = y + sample * N_SELECTED; results[1] = derivatives ? dy + (long)sample * N_SELECTED * N_COLUMNS : 0;
+        output_sensitivity(args, results, iwork, work, 0);
+        if (derivatives && TRANSITION)
+            for (k = 0; k < N_COLUMNS; k++) memcpy(dx + ((long)sample * N_COLUMNS + k) * N_X, S + k * N_W, sizeof(double) * N_X);
+        sample++;
+    }
+    return N;
+}
+
+/* Chains the transitions of N samples into derivatives to the initial states and to n_moves moves; move[j] is in force in sample j.
+   Q = N_X + n_moves * N_COMMANDS columns; X holds Q * N_X numbers, twice. */
+PGEXCITE_PUBLIC void pgexcite_condense(int N, int n_moves, const int *move, const double *dy, const double *dx, double *X,
+                                       double *G) {
+    int Q = N_X + n_moves * N_COMMANDS, j, q, k, i;
+    double *next = X + (long)Q * N_X;
+    memset(X, 0, sizeof(double) * 2 * Q * N_X);
+    for (i = 0; i < N_X; i++) X[i * N_X + i] = 1;
+    for (j = 0; j < N; j++) {
+        const double *Y = dy + (long)j * N_SELECTED * N_COLUMNS, *A = dx + (long)j * N_COLUMNS * N_X;
+        double *swap = X;
+        for (q = 0; q < Q; q++) {
+            int own = q - N_X - move[j] * N_COMMANDS;
+            double *g = G + ((long)j * Q + q) * N_SELECTED, *to = next + (long)q * N_X;
+            for (i = 0; i < N_SELECTED; i++) g[i] = own >= 0 && own < N_COMMANDS ? Y[(N_X + own) * N_SELECTED + i] : 0;
+            for (i = 0; i < N_X; i++) to[i] = own >= 0 && own < N_COMMANDS ? A[(N_X + own) * N_X + i] : 0;
+            if (q >= N_X && q >= N_X + (move[j] + 1) * N_COMMANDS) continue;
+            for (k = 0; k < N_X; k++) {
+                double v = X[(long)q * N_X + k];
+                if (v == 0) continue;
+                for (i = 0; i < N_SELECTED; i++) g[i] += Y[k * N_SELECTED + i] * v;
+                for (i = 0; i < N_X; i++) to[i] += A[k * N_X + i] * v;
+            }
+        }
+        X = next; next = swap;
+    }
+}
