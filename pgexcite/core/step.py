@@ -164,7 +164,8 @@ class Kernel:
             done += count
             if done == n:
                 break
-            if not self._subdivide(rule, h):
+            # The loop gives up where the fixed order of elimination fails, in C and in the virtual machine alike.
+            if not self.take(rule, h, startup) and not self._subdivide(rule, h):
                 break
             rescued += 1
             startup = max(startup - 1, 0)
@@ -184,7 +185,7 @@ class Kernel:
             given = [self.x, self.z, self.d, self.u, self.p]
             return self._compiled.advance(RULES.index(rule), h, n, startup, [*given, *rows])
         for k in range(n):
-            if not self.take(rule, h, startup):
+            if not self.take(rule, h, startup, pivoting=False):
                 return k, startup
             startup = max(startup - 1, 0)
             if self.d.size and self.renew_discrete(h):
@@ -217,8 +218,14 @@ class Kernel:
         self.c[0] = 0.0
         self._history.trigger()
 
-    def take(self, rule: Rule, h: float, startup: int) -> bool:
-        """Move ``x`` and ``z`` one step on; ``False``, and nothing moved, where the stages do not converge."""
+    def take(self, rule: Rule, h: float, startup: int, *, pivoting: bool = True) -> bool:
+        """Move ``x`` and ``z`` one step on; ``False``, and nothing moved, where the stages do not converge.
+
+        Args:
+            rule, h: of the step.
+            startup: backward-Euler steps still to be taken (trapezoidal rule only).
+            pivoting: whether the pivoting solver takes over where the fixed order of elimination fails.
+        """
         n_x, w, start = self._n_x, self.w, self.start
         start[:n_x], start[n_x:] = self.x, self.z
         w[:] = start
@@ -228,19 +235,19 @@ class Kernel:
         else:
             self.c[0] = h / 2 if rule == "trapezoidal" else GAMMA * h / 2
             self._history.trigger()
-        if not self._solve():
+        if not self._solve(pivoting):
             return False
         if rule == "tr_bdf2":
             self.middle[:], self.b_middle[:] = w, self.b
             self.b[:] = self.mass * (ALPHA * w[:n_x] - BETA * self.x)
             w += ((1 - GAMMA) / GAMMA) * (w - start)
-            if not self._solve():
+            if not self._solve(pivoting):
                 return False
         self.x[:], self.z[:] = w[:n_x], w[n_x:]
         return True
 
-    def _solve(self) -> bool:
-        """Newton on the stage from ``_w``, in place."""
+    def _solve(self, pivoting: bool = True) -> bool:
+        """Newton on the stage from ``w``, in place."""
         if self._newton is not None:
             start = self.w.copy()
             for iteration in range(MAX_ITERATIONS):
@@ -252,6 +259,8 @@ class Kernel:
                 if not self._norm[0] < 1e20:
                     break
             self.w[:] = start
+            if not pivoting:
+                return False
         return self._solve_pivoting()
 
     def _solve_pivoting(self) -> bool:
