@@ -27,3 +27,11 @@ def quadratic_excess(e_fd: Expr, E_1: Expr, SE_1: Expr, E_2: Expr, SE_2: Expr) -
     B = s_2 / ((e_2 - A) * (e_2 - A))
     above = ca.fmax(e_fd - A, 0.0)
     return on * B * above * above
+
+
+def rectifier(load: Expr) -> Expr:
+    """``F_EX``: share of a diode bridge's open-circuit voltage left at this normalised load (IEEE Std 421.5, annex D)."""
+    middle = ca.sqrt(ca.fmax(0.75 - load * load, 1e-12))
+    light = ca.fmin(1.0 - 0.577 * load, 1.0)
+    heavy = ca.fmax(1.732 * (1.0 - load), 0.0)
+    return ca.if_else(load <= 0.433, light, ca.if_else(load < 0.75, middle, heavy))

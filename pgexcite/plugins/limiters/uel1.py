@@ -15,6 +15,9 @@ from pgexcite.core.roles import Limiter
 _LOWEST_VOLTAGE = 0.1
 """Terminal voltage, pu, below which the armature current is no longer computed from power and voltage."""
 
+_EMPTYING = 0.1
+"""Time constant, s, with which the integrator empties inside the circle at the fastest."""
+
 
 class UEL1(Limiter):
     """Raises the excitation where the operating point leaves a circle around ``Q = K_UC V^2``.
@@ -23,7 +26,8 @@ class UEL1(Limiter):
         K_UR v_t           (<= V_URMAX) ----(-)         -->[ (1+sT_U3)/(1+sT_U4) ]-->[clip V_UIMIN..V_UIMAX]--> v_uel
 
     Inside the circle the signal is negative: for a high-value gate (ST1A's uel_position 2 or 3). With ``V_UIMIN = 0`` it is zero
-    there, for a sum at the regulator's input. The gains are in per unit of the gate's signal.
+    there, for a sum at the regulator's input. The integrator works beyond the circle only, between 0 and ``V_UIMAX``. The gains
+    are in per unit of the gate's signal.
 
     Not modelled: the excitation system's stabiliser signal (``K_UF``).
     """
@@ -55,9 +59,9 @@ class UEL1(Limiter):
 
     def equations(self, v: Signals) -> Equations:
         error = self._error(v.v_t, v.p_e, v.q_e)
-        # Without integral action the integrator returns to zero, so that its state is determined.
-        drive = ca.if_else(self.K_UI > 0, self.K_UI * error, -v.x_i)
-        integral = integrator(drive, v.x_i, lower=ca.fmin(self.V_UIMIN, 0.0), upper=ca.fmax(self.V_UIMAX, 0.0))
+        # Inside the circle the integrator empties and rests at zero: wound down to V_UIMIN it would have no steady state.
+        drive = ca.fmax(self.K_UI * error, -v.x_i / _EMPTYING)
+        integral = integrator(drive, v.x_i, lower=ca.SX(0), upper=self.V_UIMAX)
         bounded = self._held(self.K_UL * error + integral.y)
         first = lead_lag(bounded, v.x_1, T_lead=self.T_U1, T_lag=self.T_U2)
         second = lead_lag(first.y, v.x_2, T_lead=self.T_U3, T_lag=self.T_U4)
