@@ -159,6 +159,10 @@ class Symbols:
             own = self._own[path]
             by_symbol = {row.state.element_hash(): row for row in equations.rows()}
             component = self._copies[path]
+            for item in component.variables(Kind.STATE):
+                require(
+                    own[item.name].element_hash() in by_symbol, f"{path}: no row is stated for the state {item.name}"
+                )
             rows += [
                 (f"{path}.{item.name}", _substituted(by_symbol[own[item.name].element_hash()], substitute))
                 for item in component.variables(Kind.STATE)
