@@ -23,9 +23,11 @@ from pgexcite.core.step import Kernel
 
 Array = NDArray[np.float64]
 
-_SHORTEST = 1.0 / 256.0
+SHORTEST = 1.0 / 256.0
 """Shortest fraction of a Gauss-Newton step the line search tries."""
-_DECREASE = 1e-4
+_SAME_STATE = 1e-9
+"""Without derivatives to the state a prepared plan holds only where the state is what was expected, to rounding."""
+DECREASE = 1e-4
 """Armijo's constant: the share of the predicted decrease that must be had."""
 
 
@@ -39,6 +41,8 @@ class ShootingOptions:
         jump_iterations: QPs for one plan where the state is not what was expected.
         jump: difference of a state from what was expected that counts as a jump.
         tolerance: largest change of a command at which a plan has converged.
+        exact: whether the state comes out exactly as expected unless something happened (perfect information). A prepared plan
+            then needs no derivatives to the state, which many states make dear.
     """
 
     mode: Literal["rti", "converged"] = "rti"
@@ -46,6 +50,7 @@ class ShootingOptions:
     jump_iterations: int = 4
     jump: float = 1e-3
     tolerance: float = 1e-6
+    exact: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,16 +90,16 @@ class Shooting(ABC):
         qp: QPSolver | None = None,
     ) -> None:
         self.kernel, self.problem, self.options = kernel, problem, options
-        self._rule, self._h = rule, h
+        self.rule, self._h = rule, h
         self.condensed = Condensed(problem, qp)
         model = kernel.model
         self._commands = [model.position("u", path) for path in problem.commands]
         outputs = [model.position("y", path) for path in self.condensed.outputs()]
-        prepares = options.mode == "rti"
+        corrects = options.mode == "rti" and not options.exact
         self.predictor = Predictor(
-            kernel, self._commands, outputs, problem.N_c, rule, transitions=True if prepares else None
+            kernel, self._commands, outputs, problem.N_c, rule, transitions=True if corrects else None
         )
-        self._horizons = Horizons(model, problem, h, grid)
+        self.horizons = Horizons(model, problem, h, grid)
         self._plan: Array | None = None
         self._prepared: _Prepared | None = None
         self._from: tuple[State, float] | None = None
@@ -125,10 +130,11 @@ class Shooting(ABC):
         if expected is None:
             return
         plan = self.condensed.clipped(self.problem.shifted(self._plan))
-        horizon = self._horizons.at(t + self.problem.dt, expected.u, self.p)
+        horizon = self.horizons.at(t + self.problem.dt, expected.u, self.p)
         rollout = self.predictor.roll(expected, plan, horizon, derivatives=True)
-        if rollout is not None and rollout.dy is not None and rollout.dx is not None:
-            self._prepared = _Prepared(plan, expected.x, self.p, rollout.y, rollout.dy, rollout.dx)
+        if rollout is not None and rollout.dy is not None:
+            G_x = np.zeros((*rollout.y.shape, 0)) if rollout.dx is None else rollout.dx
+            self._prepared = _Prepared(plan, expected.x, self.p, rollout.y, rollout.dy, G_x)
 
     def memory(self) -> Mapping[str, Array]:
         """Plan, linearisation and the QP's warm start."""
@@ -176,7 +182,7 @@ class Shooting(ABC):
 
     def _advance(self, state: State, t: float, u: Array) -> State | None:
         """The state one sample later under these commands, with what is known to happen; ``None`` if it cannot be had."""
-        horizon = self._horizons.at(t, state.u, self.p)
+        horizon = self.horizons.at(t, state.u, self.p)
         last = int(np.flatnonzero(horizon.ends)[0]) + 1
         row = -1
         for count, h, k in zip(horizon.counts[:last], horizon.lengths[:last], horizon.rows[:last], strict=True):
@@ -189,7 +195,7 @@ class Shooting(ABC):
                         return None
                     state = settled
                 row = int(k)
-            segment = self.kernel.advance(state, horizon.p[k], self._rule, float(h), int(count))
+            segment = self.kernel.advance(state, horizon.p[k], self.rule, float(h), int(count))
             if segment.failed:
                 return None
             state = segment.state
@@ -200,11 +206,12 @@ class Shooting(ABC):
         ready = self._prepared
         if ready is None or not np.array_equal(ready.p, self.p):
             return None
-        return ready if np.abs(state.x - ready.x).max(initial=0.0) <= self.options.jump else None
+        reach = self.options.jump if ready.G_x.shape[2] else _SAME_STATE
+        return ready if np.abs(state.x - ready.x).max(initial=0.0) <= reach else None
 
     def _feedback(self, ready: _Prepared, state: State, t: float, u_last: Array) -> Solution:
         """One QP around what was prepared, corrected for the state."""
-        y = ready.y + ready.G_x @ (state.x - ready.x)
+        y = ready.y + ready.G_x @ (state.x - ready.x) if ready.G_x.shape[2] else ready.y
         at = Linearised(y, ready.G, self.problem.references(t))
         found = self.condensed.direction(at, ready.plan, u_last)
         if found is None:
@@ -217,7 +224,7 @@ class Shooting(ABC):
     def _iterate(self, state: State, t: float, u_last: Array, hold: Array, count: int) -> Solution:
         """Gauss-Newton with a line search on the true cost."""
         references = self.problem.references(t)
-        horizon = self._horizons.at(t, state.u, self.p)
+        horizon = self.horizons.at(t, state.u, self.p)
         starts = [hold] if self._plan is None else [self.condensed.clipped(self.problem.shifted(self._plan)), hold]
         for plan in starts:
             rollout = self.predictor.roll(state, plan, horizon, derivatives=True)
@@ -241,12 +248,12 @@ class Shooting(ABC):
                 break
             better = None
             scale = 1.0
-            while better is None and scale >= _SHORTEST:
+            while better is None and scale >= SHORTEST:
                 trial = self.condensed.clipped(plan + scale * direction)
                 rolled = self.predictor.roll(state, trial, horizon, derivatives=True)
                 if rolled is not None:
                     trial_cost = self.condensed.cost(rolled.y, references, trial, u_last)
-                    if trial_cost <= cost + _DECREASE * scale * min(slope, 0.0):
+                    if trial_cost <= cost + DECREASE * scale * min(slope, 0.0):
                         better = trial, rolled, trial_cost
                 scale /= 2
             if better is None:

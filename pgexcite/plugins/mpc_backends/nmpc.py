@@ -56,6 +56,7 @@ class NMPC(BaseModel):
             jump_iterations=self.jump_iterations,
             jump=self.jump,
             tolerance=self.tolerance,
+            exact=True,
         )
         return _Perfect(plant.kernel, problem, options, surroundings, h)
 
