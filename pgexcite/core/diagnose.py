@@ -33,6 +33,31 @@ def smallest_singular_value(kernel: Kernel, state: State, p: Array) -> float:
     return float(values[-1]) if values.size else np.inf
 
 
+def active_devices(model: Model, d: Array) -> tuple[str, ...]:
+    """Limiters that act and tap changers away from their initial position at discrete states ``d``, each with what it does."""
+    found = []
+    for device in model.system.devices:
+        for slot, component in device.components.items():
+            path = device.component_path(slot)
+            if component.role == "limiter" and _discrete(model, d, f"{path}.active") > 0:
+                found.append(f"{path} acts")
+            position = _discrete(model, d, f"{path}.position") if component.role == "tap_changer" else 0.0
+            if position:
+                found.append(f"{path} at {position:+.0f}")
+    return tuple(found)
+
+
+def _discrete(model: Model, d: Array, path: str) -> float:
+    return float(d[model.index["d"][path]]) if path in model.index["d"] else 0.0
+
+
+def collapse(model: Model, state: State, bus: str, text: str) -> Outcome:
+    """A voltage collapse at ``bus``, with what was active then."""
+    active = active_devices(model, state.d)
+    told = f"{text}; active: {', '.join(active)}" if active else text
+    return Outcome(Ending.VOLTAGE_COLLAPSE, state.t, f"bus.{bus}", told, active)
+
+
 def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healthy: float) -> Outcome:
     """Outcome for a run whose next step cannot be taken from ``state``.
 
@@ -54,7 +79,7 @@ def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healt
         text = (
             f"voltage collapse at bus {bus}: from t = {state.t:.4f} s on no voltage satisfies the network and its loads"
         )
-        return Outcome(Ending.VOLTAGE_COLLAPSE, state.t, f"bus.{bus}", text)
+        return collapse(kernel.model, state, bus, text)
     worst = _worst_equation(kernel, last, p, h)
     text = f"the step after t = {state.t:.4f} s has no solution; the equation furthest from being satisfied is that of {worst}"
     return Outcome(Ending.DIVERGED, state.t, worst, text)

@@ -175,7 +175,7 @@ def read_record(directory: Path) -> Record:
     return Record(
         directory=directory,
         title=about["title"],
-        outcome=Outcome(**{**outcome, "ending": Ending(outcome["ending"])}),
+        outcome=Outcome(**{**outcome, "ending": Ending(outcome["ending"]), "active": tuple(outcome.get("active", ()))}),
         summary=json.loads((directory / SUMMARY_FILE).read_text(encoding="utf-8")),
         config=about["config"],
         trace=trace,

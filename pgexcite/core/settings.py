@@ -20,6 +20,8 @@ class Settings:
         compile: whether the step is compiled to C: ``"auto"`` where a compiler is found, ``"never"``, or ``"always"``, which
             fails where there is none.
         delta_max_deg: a rotor angle beyond this from the reference, degrees, is a loss of synchronism.
+        collapse_below: a bus that stays below this voltage, pu, is a voltage collapse; 0 waits until no solution is left.
+        collapse_after: how long it must stay below, s.
     """
 
     t_end: float
@@ -27,3 +29,5 @@ class Settings:
     rule: Rule = "tr_bdf2"
     compile: Compile = "auto"
     delta_max_deg: float = 180.0
+    collapse_below: float = 0.0
+    collapse_after: float = 1.0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.controller import Controller, Plant, Sample, Session, Surroundings
-from pgexcite.core.diagnose import diagnose, smallest_singular_value
+from pgexcite.core.diagnose import collapse, diagnose, smallest_singular_value
 from pgexcite.core.errors import ConfigError, Problem, SnapshotError
 from pgexcite.core.events import Change
 from pgexcite.core.initialise import Initial, initialise
@@ -24,6 +24,7 @@ from pgexcite.core.settings import Settings
 from pgexcite.core.step import Kernel
 from pgexcite.core.system import System
 from pgexcite.core.trace import Ending, LogEntry, Outcome, Trace
+from pgexcite.core.undervoltage import Undervoltage
 
 Array = NDArray[np.float64]
 
@@ -116,6 +117,8 @@ class Simulation:
         self.wall_time = 0.0
         self.controlled = (0.0, 0.0)
         self._pending = list(self._changes)
+        settings = self.settings
+        self._low = Undervoltage(self.model, settings.collapse_below, settings.collapse_after, settings.h)
         self._recording = _Recording()
         self._running = {name: self._start(name, controller) for name, controller in self._controllers.items()}
         self._record_point()
@@ -178,6 +181,11 @@ class Simulation:
         return self.outcome
 
     @property
+    def sessions(self) -> Mapping[str, Session]:
+        """The controllers at work, by name."""
+        return {name: running.session for name, running in self._running.items()}
+
+    @property
     def sampling(self) -> int:
         """Steps between two instants at which a controller may be due; 0 without controllers."""
         return math.gcd(*(r.every for r in self._running.values()))
@@ -215,19 +223,26 @@ class Simulation:
         done = segment.x.shape[0]
         t: Array = np.arange(before.k + 1, before.k + 1 + done, dtype=np.float64) * self.settings.h
         lost = self._angles.first_beyond(segment.x, segment.y, self.settings.delta_max_deg)
-        keep = done if lost is None else lost[0] + 1
+        low = self._low.watch(segment.y)
+        rows = [found[0] + 1 for found in (lost, low) if found is not None]
+        keep = min(rows, default=done)
         self._recording.add(t[:keep], segment.x[:keep], segment.z[:keep], segment.d[:keep], before.u, segment.y[:keep])
         if segment.rescued:
             text = f"{segment.rescued} steps up to t = {segment.state.t:g} s needed shorter inner steps or pivoting"
             self._recording.log.append(LogEntry(segment.state.t, "solver", text))
         self.state = segment.state
-        if lost is not None:
-            row, unit, angle = lost
-            self.state = State(
-                before.k + row + 1, float(t[row]), segment.x[row], segment.z[row], segment.d[row], before.u
-            )
-            text = f"{unit} lost synchronism at t = {t[row]:.4f} s: its rotor angle reached {angle:.1f} degrees"
-            self._end(Outcome(Ending.LOST_SYNCHRONISM, float(t[row]), unit, text))
+        if rows:
+            row = keep - 1
+            self.state = State(before.k + keep, float(t[row]), segment.x[row], segment.z[row], segment.d[row], before.u)
+        if lost is not None and lost[0] == keep - 1:
+            _, unit, angle = lost
+            text = f"{unit} lost synchronism at t = {self.state.t:.4f} s: its rotor angle reached {angle:.1f} degrees"
+            self._end(Outcome(Ending.LOST_SYNCHRONISM, self.state.t, unit, text))
+        elif low is not None:
+            _, bus, voltage = low
+            text = f"voltage collapse at bus {bus} at t = {self.state.t:.4f} s: {voltage:.3f} pu"
+            text += f", below {self.settings.collapse_below:g} pu for {self.settings.collapse_after:g} s"
+            self._end(collapse(self.model, self.state, bus, text))
         elif segment.failed:
             self._end(diagnose(self.kernel, self.state, self.p, self.settings.rule, self.settings.h, self._healthy))
 
@@ -393,6 +408,7 @@ class Simulation:
         for name, r in self._running.items():
             memory[f"instruments:{name}"] = r.instruments.memory()
             memory[f"active:{name}"] = np.array(float(r.active))
+        memory["low"] = self._low.elapsed
         memory["applied"] = np.array(len(self._changes) - len(self._pending))
         self.state.save(path, self.model, self.p, memory)
 
@@ -413,6 +429,7 @@ class Simulation:
             running.instruments.recall(memory[f"instruments:{name}"])
             running.active = bool(memory[f"active:{name}"] > 0)
         self._pending = self._changes[int(memory["applied"]) :]
+        self._low.elapsed = memory["low"].copy()
         self._recording = _Recording()
         self._record_point()
 

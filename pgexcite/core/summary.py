@@ -21,7 +21,8 @@ SETTLING_HOLD = 1.0
 def summarise(result: RunResult) -> dict[str, Any]:
     """The content of ``summary.json``, as plain data.
 
-    Of the run: ``outcome``, ``t_end`` [s], ``steps``, ``wall_time`` [s]. Of each unit, ``None`` where the unit has no such signal:
+    Of the run: ``outcome``, ``where`` and ``active`` (see ``Outcome``), ``t_end`` [s], ``steps``, ``wall_time`` [s]. Of each
+    unit, ``None`` where the unit has no such signal:
 
     - ``delta_max_deg``: largest rotor angle against the angle reference, degrees;
     - ``v_t_min``: smallest terminal voltage, pu;
@@ -37,6 +38,8 @@ def summarise(result: RunResult) -> dict[str, Any]:
     realtime = {} if result.timing is None else {"realtime": result.timing.summary()}
     return {
         "outcome": result.outcome.ending.value,
+        "where": result.outcome.where,
+        "active": list(result.outcome.active),
         "t_end": float(result.outcome.t),
         "steps": int(result.steps),
         "wall_time": float(result.wall_time),

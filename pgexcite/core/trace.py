@@ -30,12 +30,14 @@ class Outcome:
         t: time of the last sample kept, s.
         where: path of the machine, bus or equation to blame; ``""`` when completed.
         message: a sentence for a person.
+        active: of a voltage collapse, the limiters that act and the tap changers that have moved, each with what it does.
     """
 
     ending: Ending
     t: float
     where: str = ""
     message: str = ""
+    active: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return self.message or self.ending.value

@@ -20,7 +20,7 @@ def trace_of(t, v_t, events=(), **columns):
 
 def test_keys_are_those_of_the_file_format(synthetic_run):
     found = summarise(synthetic_run(mpc=True))
-    assert list(found) == ["outcome", "t_end", "steps", "wall_time", "units", "controllers"]
+    assert list(found) == ["outcome", "where", "active", "t_end", "steps", "wall_time", "units", "controllers"]
     assert list(found["units"]["G2"]) == [
         "delta_max_deg", "v_t_min", "v_t_iae", "omega_max", "e_fd_max", "i_fd_max", "settled_at",
     ]  # fmt: skip

@@ -36,6 +36,10 @@ class SimulationTable(Table):
     rule: Rule = Field("tr_bdf2", description="integration rule")
     compile: Compile = Field("auto", description="whether the step is compiled to C")
     delta_max_deg: float = Field(180.0, gt=0, description="rotor angle beyond which synchronism is lost, degrees")
+    collapse_below: float = Field(
+        0.0, ge=0, description="voltage of a bus, pu, below which it collapses; 0 waits until no solution is left"
+    )
+    collapse_after: float = Field(1.0, ge=0, description="how long it must stay below, s")
     reference: str = Field(
         "auto", description="what rotor angles are measured against: auto, infinite_bus, centre_of_inertia or a unit"
     )
