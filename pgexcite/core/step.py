@@ -263,6 +263,7 @@ class Kernel:
                 return False
         return self._solve_pivoting()
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _solve_pivoting(self) -> bool:
         """Damped Newton on the stage with a pivoting sparse LU, where the fixed order fails or does not exist."""
         w = self.w.copy()

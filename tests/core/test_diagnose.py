@@ -18,7 +18,7 @@ from pgexcite.core.simulate import Simulation
 from pgexcite.core.system import Device, Schedule, System
 from pgexcite.core.trace import Ending
 from pgexcite.plugins.exciters.constant import ConstantField
-from pgexcite.plugins.loads.zip import ConstantPower
+from pgexcite.plugins.loads.zip import ConstantCurrent, ConstantPower
 from pgexcite.plugins.sources.infinite_bus import InfiniteBus
 
 
@@ -95,7 +95,7 @@ def test_a_chunk_of_steps_is_cut_back_to_the_sample_where_it_ends():
 # Voltage collapse.
 
 
-def radial(P, X=0.5, V_min=0.2):
+def radial(P, X=0.5, V_min=0.2, Q=0.0, cls=ConstantPower):
     """A constant-power load at the end of a lossless line of two halves: the nose is at ``1 / 2X`` and ``V = 1 / sqrt 2``."""
     return System(
         S_base=100.0,
@@ -107,7 +107,7 @@ def radial(P, X=0.5, V_min=0.2):
         },
         devices=(
             Device("infinite_bus.grid", "INF", 100.0, {"": InfiniteBus()}, Schedule(V=1.0, angle=0.0)),
-            Device("load.D", "E", 100.0, {"": ConstantPower(P=P, V_min=V_min)}, Schedule(P=-P, Q=0.0)),
+            Device("load.D", "E", 100.0, {"": cls(P=P, Q=Q, V_min=V_min)}, Schedule(P=-P, Q=-Q)),
         ),
     )
 
@@ -167,9 +167,11 @@ def test_voltage_collapse_when_a_line_trips(X, ending):
 
 
 @pytest.mark.parametrize("line", ["L1", "L2"])
-def test_an_islanded_constant_power_has_no_voltage(line):
-    """Its current vanishes as the voltage runs away to infinity: that is no solution."""
-    sim = run(radial(50.0), BranchTrip(type="line_trip", t=0.5, name=line).changes())
+@pytest.mark.parametrize("cls", [ConstantPower, ConstantCurrent])
+@pytest.mark.parametrize("V_min", [0.2, 0.7])
+def test_an_islanded_load_has_no_voltage(line, cls, V_min):
+    """The current of a constant power vanishes as its voltage runs away to infinity: that is no solution."""
+    sim = run(radial(40.0, Q=10.0, cls=cls, V_min=V_min), BranchTrip(type="line_trip", t=0.5, name=line).changes())
     assert sim.outcome.ending is Ending.VOLTAGE_COLLAPSE
     assert sim.outcome.where in {"bus.M", "bus.E"}
     assert last(sim, "bus.E.v") < 1.0
