@@ -74,9 +74,9 @@ def test_names_need_no_import():
 @pytest.mark.parametrize(
     ("role", "name", "expected"),
     [
-        ("exciter", "st1b", "did you mean 'st1a'? known: constant_field, "),
+        ("exciter", "st1b", "did you mean 'st1a'? known: ac1a, constant_field, "),
         ("exciter", "ST1A", "did you mean 'st1a'"),
-        ("exciter", "qqqqqq", "no exciter is named 'qqqqqq'; known: constant_field"),
+        ("exciter", "qqqqqq", "no exciter is named 'qqqqqq'; known: ac1a, constant_field"),
         ("exciters", "st1a", "there is no role 'exciters'; did you mean 'exciter'?"),
     ],
 )
