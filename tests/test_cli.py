@@ -263,6 +263,14 @@ def test_realtime_needs_a_controller(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_export_writes_a_controller(tmp_path):
+    found = figures("export-c", SMIB / "fault_nmpc.toml", tmp_path / "c", *SHORT)
+    assert found["files"] == ["CMakeLists.txt", "mpc.c", "mpc.h", "mpc_replay.c", "replay.txt"]
+    assert found["samples"] == 30
+    assert "30 samples to replay" in call("export-c", SMIB / "fault_nmpc.toml", tmp_path / "c", *SHORT).stdout
+    assert call("export-c", SMIB / "fault_nmpc.toml", tmp_path / "c", "--controller", "other").exit_code == 3
+
+
 def test_a_live_run_ends_without_a_viewer(tmp_path):
     result = call("run", SMIB / "fault_st1a.toml", *SHORT, "--live", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.stderr

@@ -254,7 +254,9 @@ def equal_area(config: Path, overrides: tuple[str, ...], figure: Path | None, as
 @_config
 @_set
 @click.option("--load", "loads", multiple=True, metavar="NAME", help="A load to scale; may be repeated [all].")
-@click.option("--tan-phi", "tangents", multiple=True, type=float, help="Q/P given to these loads; may be repeated [own].")
+@click.option(
+    "--tan-phi", "tangents", multiple=True, type=float, help="Q/P given to these loads; may be repeated [own]."
+)
 @click.option("--bus", help="Bus whose voltage is drawn [the weakest].")
 @click.option("--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw the curves into this file.")
 @_json
@@ -276,7 +278,9 @@ def pv(
 
     scenario = load(config, overrides)
     if bus is not None and bus not in scenario.system.buses:
-        raise click.BadParameter(f"there is no bus {bus}; buses are {', '.join(scenario.system.buses)}", param_hint="--bus")
+        raise click.BadParameter(
+            f"there is no bus {bus}; buses are {', '.join(scenario.system.buses)}", param_hint="--bus"
+        )
     curves = [
         ("own power factor" if tangent is None else f"tan φ = {tangent:g}", pv_curve(scenario.system, loads, tangent))
         for tangent in (tangents or (None,))
@@ -290,6 +294,26 @@ def pv(
         show.json({"curves": [{"label": label, **curve.as_dict()} for label, curve in curves]})
     else:
         show.table([curve.row(label, shown) for label, curve in curves])
+
+
+@main.command(name="export-c")
+@_config
+@click.argument("directory", type=click.Path(path_type=Path, file_okay=False))
+@_set
+@click.option("--controller", default="", metavar="NAME", help="Which controller, where there are several.")
+@_json
+def export_c(config: Path, directory: Path, overrides: tuple[str, ...], controller: str, as_json: bool) -> None:
+    """Write a controller as self-contained C into DIRECTORY, with the scenario's run as its test."""
+    from pgexcite.core.config import load
+    from pgexcite.core.export import export_c as export
+
+    found = export(load(config, overrides), directory, controller)
+    files = sorted(path.name for path in found.directory.iterdir() if path.is_file())
+    if as_json:
+        show.json({"directory": str(found.directory), "name": found.name, "samples": found.samples, "files": files})
+    else:
+        click.echo(f"{found.directory}: {', '.join(files)}; {found.samples} samples to replay")
+        click.echo(f"cmake -S {directory} -B build && cmake --build build && ctest --test-dir build")
 
 
 @main.command()

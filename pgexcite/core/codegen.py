@@ -62,13 +62,13 @@ def generate(functions: Sequence[ca.Function], constants: Mapping[str, object], 
     sizes = {key: max(1, *(getattr(f, key)() for f in functions)) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}
     values = {"pgexcite_public": "", **constants, **sizes}
     defines = "".join(f"#define {name.upper()} {value}\n" for name, value in values.items())
-    loops = [loop("step"), loop("rollout")] if rollout else [loop("step")]
+    loops = [loop("step.c"), loop("rollout.c")] if rollout else [loop("step.c")]
     return "\n".join([write_functions(functions), defines, *loops])
 
 
 def loop(name: str) -> str:
-    """Text of one of the loops around the generated functions, ``c/<name>.c``."""
-    return (_LOOPS / f"{name}.c").read_text(encoding="utf-8")
+    """Text of one of the files in ``c``, which go around the generated functions."""
+    return (_LOOPS / name).read_text(encoding="utf-8")
 
 
 def write_functions(functions: Sequence[ca.Function]) -> str:
@@ -92,7 +92,7 @@ def write_functions(functions: Sequence[ca.Function]) -> str:
     bodies = re.findall(r"^static int casadi_f\d+\(.*?^}\n", source, re.DOTALL | re.MULTILINE)
     names = re.findall(r"^int \w+\(const casadi_real\*\* arg.*?^}\n", source, re.DOTALL | re.MULTILINE)
     if helpers is None or len(names) != len(functions) or len(bodies) < len(names):
-        raise CompilationError(f"CasADi {ca.__version__} lays its C out otherwise than the versions known here")
+        raise CompilationError(f"CasADi {ca.CasadiMeta.version()} lays its C out otherwise than the versions known here")
     # Names need no prefix once they are static.
     arithmetic = re.sub(r"^#define casadi_\w+ CASADI_PREFIX\(\w+\)\n", "", helpers[0], flags=re.MULTILINE)
     arithmetic = re.sub(r"^(?=casadi_real casadi_)", "static ", arithmetic, flags=re.MULTILINE)

@@ -68,7 +68,7 @@ class Ladder:
         self, problem: Problem, solver: Solver, actuator: Actuator, options: LadderOptions, u_0: Array
     ) -> None:
         self.problem, self.solver, self.actuator, self.options = problem, solver, actuator, options
-        self._u_0 = u_0
+        self.u_0 = u_0
         self._u, self._move = u_0, np.zeros_like(u_0)
         self._next = u_0
         self._plan = np.tile(u_0, (problem.N_c, 1))
@@ -228,4 +228,4 @@ class Ladder:
     def _returned(self) -> Array:
         """The set-point on its way back to where it was before this controller moved it."""
         reach = self.options.return_rate * self.problem.dt
-        return self._u + np.clip(self._u_0 - self._u, -reach, reach)
+        return self._u + np.clip(self.u_0 - self._u, -reach, reach)

@@ -113,7 +113,7 @@ class Predictor:
         n_x, n_u = kernel.x.size, len(commands)
         self.transitions = n_x < (n_moves - 1) * n_u if transitions is None else transitions
         columns = n_x + n_u if self.transitions else n_moves * n_u
-        self._functions = _write_sensitivities(kernel, self._commands, self._outputs, columns)
+        self._functions = write_sensitivities(kernel, self._commands, self._outputs, columns)
         self._library = self._compile(columns)
         stage, history, output = self._functions
         k, rows = kernel, (kernel.w.size, n_x, n_u, self._outputs.size)
@@ -297,7 +297,7 @@ def _address(array: NDArray[Any]) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 
-def _write_sensitivities(
+def write_sensitivities(
     kernel: Kernel, commands: NDArray[np.int32], outputs: NDArray[np.int32], columns: int
 ) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Derivatives of a stage, of its history and of the selected outputs to ``columns`` moves.
