@@ -128,6 +128,7 @@ def operating_point(initial: Initial) -> dict[str, Any]:
             "Q [Mvar]": flow.s[device.path].imag * system.S_base,
         }
         for device in system.devices
+        if device.path not in system.branches()  # a tap changer delivers nothing
     ]
     return {"residual": initial.residual, "buses": buses, "devices": devices}
 
