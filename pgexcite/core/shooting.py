@@ -16,7 +16,7 @@ from pgexcite.core.controller import Sample
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem, Solution, Status
-from pgexcite.core.prediction import Predictor
+from pgexcite.core.prediction import Horizon, Predictor, Rollout
 from pgexcite.core.qp import QuadraticProgram
 from pgexcite.core.settings import Rule
 from pgexcite.core.step import Kernel
@@ -221,16 +221,36 @@ class Shooting(ABC):
         cost = self.condensed.cost(y + ready.G @ step.ravel(), at.references, plan, u_last)
         return Solution(Status.ITERATED, plan, cost, 1, float(np.abs(step).max()))
 
+    def _first(self, plans: list[Array], state: State, horizon: Horizon) -> tuple[Array, Rollout | None]:
+        """The first of these plans that the model can be stepped through."""
+        for plan in plans:
+            rollout = self.predictor.roll(state, plan, horizon, derivatives=True)
+            if rollout is not None:
+                return plan, rollout
+        return plans[0], None
+
+    def _towards_bounds(self, u_last: Array) -> list[Array]:
+        """All commands to their upper bounds, and to their lower ones, as fast as they may move.
+
+        What else to try where neither the old plan nor holding the command lets the model live through the horizon.
+        """
+        problem = self.problem
+        reach = np.arange(1, problem.N_c + 1)[:, None] * problem.du_max
+        return [
+            u_last + np.clip(bound - u_last, -reach, reach)
+            for bound in (problem.u_max, problem.u_min)
+            if np.isfinite(bound).all()
+        ]
+
     def _iterate(self, state: State, t: float, u_last: Array, hold: Array, count: int) -> Solution:
         """Gauss-Newton with a line search on the true cost."""
         references = self.problem.references(t)
         horizon = self.horizons.at(t, state.u, self.p)
         starts = [hold] if self._plan is None else [self.condensed.clipped(self.problem.shifted(self._plan)), hold]
-        for plan in starts:
-            rollout = self.predictor.roll(state, plan, horizon, derivatives=True)
-            if rollout is not None:
-                break
-        else:
+        plan, rollout = self._first(starts, state, horizon)
+        if rollout is None:
+            plan, rollout = self._first(self._towards_bounds(u_last), state, horizon)
+        if rollout is None:
             return Solution(Status.PREDICTION_FAILED, hold, np.inf, 0, np.inf)
         cost = self.condensed.cost(rollout.y, references, plan, u_last)
         status, step, iteration = Status.ITERATED, np.inf, 0

@@ -7,9 +7,10 @@ discrete-time plant.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from pgexcite.core.controller import Plant, Sample, Surroundings
 from pgexcite.core.declare import par
@@ -17,6 +18,7 @@ from pgexcite.core.errors import ConfigError, Problem
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solver
+from pgexcite.core.registry import nearest
 from pgexcite.core.shooting import Shooting, ShootingOptions
 from pgexcite.core.step import Kernel
 
@@ -27,6 +29,9 @@ class NMPC(BaseModel):
     With ``mode = "rti"`` a sample solves one quadratic program, prepared before the sample around the plan it expects; where the
     state or the network is not what was expected (a fault), ``jump_iterations`` are made instead. ``"converged"`` iterates every
     plan to ``tolerance``.
+
+    ``mismatch`` makes the model wrong where that is wanted: it predicts with other values of the parameters named, by the same
+    equations. The state it starts from remains the plant's own.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -37,13 +42,16 @@ class NMPC(BaseModel):
     jump_iterations: int = par(4, "-", "QPs solved for one plan where the state is not what was expected", ge=1)
     jump: float = par(1e-3, "pu", "difference of a state from what was expected that counts as a jump", gt=0)
     tolerance: float = par(1e-6, "pu", "largest change of a command at which a plan has converged", gt=0)
+    mismatch: Mapping[str, float] = Field(
+        default_factory=dict, description="parameters the model is wrong about: path -> value it predicts with"
+    )
     step: float = par(0.0, "s", "prediction step in the first interval; 0 takes the simulation's", ge=0)
 
     def start(self, problem: ControlProblem, surroundings: Surroundings, plant: Plant | None) -> Solver:
         """Begin a run.
 
         Raises:
-            ConfigError: the prediction step does not divide the sample time.
+            ConfigError: the prediction step does not divide the sample time, or a parameter of ``mismatch`` does not exist.
         """
         assert plant is not None, "a perfect-information backend is always handed the plant"
         h = self.step or surroundings.h
@@ -58,19 +66,42 @@ class NMPC(BaseModel):
             tolerance=self.tolerance,
             exact=True,
         )
-        return _Perfect(plant.kernel, problem, options, surroundings, h)
+        return _Perfect(plant.kernel, problem, options, surroundings, h, self._wrong(plant))
+
+    def _wrong(self, plant: Plant) -> dict[int, float]:
+        """Positions of the parameters the model is wrong about, and its values of them."""
+        known = plant.model.index["p"]
+        unknown = [path for path in self.mismatch if path not in known]
+        if unknown:
+            raise ConfigError(
+                [
+                    Problem(f"options.mismatch.{path}", "there is no such parameter", hint=nearest(path, list(known)))
+                    for path in unknown
+                ]
+            )
+        return {known[path]: value for path, value in self.mismatch.items()}
 
 
 class _Perfect(Shooting):
     """Shooting from the plant's own state."""
 
     def __init__(
-        self, kernel: Kernel, problem: ControlProblem, options: ShootingOptions, surroundings: Surroundings, h: float
+        self,
+        kernel: Kernel,
+        problem: ControlProblem,
+        options: ShootingOptions,
+        surroundings: Surroundings,
+        h: float,
+        wrong: Mapping[int, float],
     ) -> None:
+        self._wrong = wrong
         super().__init__(kernel, problem, options, rule=surroundings.rule, h=h, grid=surroundings.h)
 
     def locate(self, sample: Sample) -> State | None:
         assert sample.state is not None
         assert sample.p is not None
         self.p = sample.p
+        if self._wrong:
+            self.p = sample.p.copy()
+            self.p[list(self._wrong)] = list(self._wrong.values())
         return sample.state

@@ -8,6 +8,7 @@ import pytest
 from plants import kobbelv
 
 from pgexcite.core.controller import Plant, Sample, Surroundings
+from pgexcite.core.errors import ConfigError
 from pgexcite.core.events import Fault
 from pgexcite.core.mpc import Problem, Status
 from pgexcite.core.qp import QuadraticProgram
@@ -21,7 +22,7 @@ COMMAND = "unit.G2.exciter.e_fd_ref"
 H = 0.005
 
 
-def make(t, rule="tr_bdf2", **changes):
+def make(t, rule="tr_bdf2", mismatch=None, **changes):
     """The plant at ``t`` of a fault run, the problem, and a solver of it."""
     sim = Simulation(kobbelv(), Settings(1.0, H, rule, "never"), FAULT.changes())
     sim.run(until=t)
@@ -44,7 +45,8 @@ def make(t, rule="tr_bdf2", **changes):
     problem = Problem(**(values | changes))
     surroundings = Surroundings(H, rule, dict(zip(model.u_names, sim.state.u, strict=True)), {}, model.system)
     plant = Plant(model, Kernel(model, sim.initial.state, sim.initial.p, "never"), sim.p)
-    solver = NMPC(mode="converged", max_iterations=100, tolerance=1e-9).start(problem, surroundings, plant)
+    options = NMPC(mode="converged", max_iterations=100, tolerance=1e-9, mismatch=mismatch or {})
+    solver = options.start(problem, surroundings, plant)
     return sim, problem, solver
 
 
@@ -207,3 +209,46 @@ def test_contradictory_rows_end_quickly_and_unsolved():
     )
     assert not solution.solved
     assert solution.iterations <= 60 * 60
+
+
+def test_a_model_that_is_wrong_about_a_parameter_predicts_with_it_from_the_true_state():
+    R = np.array([1.0])
+    sim, _, solver = make(0.25, R=R)
+    u, right = solve(sim, solver)
+    same = make(0.25, R=R, mismatch={"line.L1.X": 0.15, "unit.G2.machine.H": 2.9})[2]
+    assert np.array_equal(solve(sim, same)[1].u, right.u)
+    wrong = make(0.25, R=R, mismatch={"line.L1.X": 0.3})[2]
+    plan = solve(sim, wrong)[1]
+    assert plan.status is Status.CONVERGED
+    assert np.abs(plan.u - right.u).max() > 0.1  # measured 0.18
+    elsewhere = sim.p.copy()
+    elsewhere[sim.model.index["p"]["line.L1.X"]] = 0.3
+    told = solver.solve(Sample(sim.state.t, {}, True, sim.state, elsewhere), u)
+    assert told.u == pytest.approx(plan.u, abs=1e-6)  # the plan of a solver whose plant really is so
+    assert sim.get("line.L1.X") == 0.15
+
+
+def test_a_mismatch_of_a_parameter_that_does_not_exist_is_refused():
+    with pytest.raises(ConfigError, match=r"options\.mismatch\.line\.L9\.X.*no such parameter"):
+        make(0.0, mismatch={"line.L9.X": 0.3})
+
+
+@pytest.mark.parametrize(("bound", "du_max"), [(3.2, np.inf), (-3.2, np.inf), (3.2, 0.5)])
+def test_where_neither_the_old_plan_nor_holding_can_be_predicted_the_bounds_are_tried(bound, du_max, monkeypatch):
+    sim, _, solver = make(0.25, du_max=np.array([du_max]))
+    u = sim.get(COMMAND)
+    begin = u + np.clip(bound - u, -du_max * np.arange(1, 4), du_max * np.arange(1, 4))
+    roll, tried = solver.predictor.roll, []
+
+    def fails_elsewhere(state, plan, horizon, **options):
+        tried.append(plan.ravel().copy())
+        near = np.allclose(plan.ravel(), begin) or len(tried) > 4
+        return roll(state, plan, horizon, **options) if near else None
+
+    monkeypatch.setattr(solver.predictor, "roll", fails_elsewhere)
+    solution = solve(sim, solver)[1]
+    assert any(np.allclose(plan, begin) for plan in tried)
+    assert solution.status.usable
+    assert np.abs(np.diff(solution.u.ravel(), prepend=u)).max() <= du_max + 1e-6
+    monkeypatch.setattr(solver.predictor, "roll", lambda *_, **__: None)
+    assert solve(sim, solver)[1].status is Status.PREDICTION_FAILED
