@@ -1,0 +1,315 @@
+"""One predictive control problem, several solvers, one run: real-time iterations (Python and exported C), do-mpc, SLSQP.
+
+The plant is the paper's, 0.1 s of arc fault inside; sample 50 ms, five steps to a sample, N moves for N samples. All solvers get
+the same sequence of states, that of a closed loop under converged plans, and keep their own warm start; the exported C replays the
+loop that it closes itself. do-mpc transcribes the same equations by its own collocation, as shipped and with its program compiled.
+SLSQP is single shooting on the compiled prediction with finite differences.
+
+Run: python tools/bench/mpc.py [--horizons 5 10 20] [--passes 30]      (do-mpc is left out where it is not installed)
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import contextlib
+import ctypes
+import gc
+import importlib.util
+import json
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.optimize import minimize
+
+from pgexcite.core import codegen
+from pgexcite.core.config import load
+from pgexcite.core.controller import Sample
+from pgexcite.core.export import export_c
+from pgexcite.core.prediction import Predictor
+from pgexcite.core.simulate import Simulation
+
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "configs" / "smib" / "fault_nmpc.toml"
+COMMAND = "unit.G2.exciter.e_fd_ref"
+FAULT = "bus.HV.fault_status"
+
+
+@dataclass
+class Times:
+    """Times of one solver, s, and its first commands."""
+
+    cpu: list[float] = field(default_factory=list)
+    wall: list[float] = field(default_factory=list)
+    commands: list[float] = field(default_factory=list)
+
+    def measure(self, call: Callable[[], Any]) -> Any:
+        """Call, and note what it took."""
+        cpu, wall = time.thread_time(), time.perf_counter()
+        found = call()
+        self.wall.append(time.perf_counter() - wall)
+        self.cpu.append(time.thread_time() - cpu)
+        return found
+
+    def row(self, reference: np.ndarray) -> dict[str, Any]:
+        """Medians and tails, us, and how far the commands are from the converged ones, pu."""
+        off = np.abs(np.resize(reference, len(self.commands)) - self.commands)
+        row: dict[str, Any] = {"samples": len(self.cpu)}
+        for name, times in (("cpu", self.cpu), ("wall", self.wall)):
+            for label, q in (("median", 50), ("p99", 99), ("p99.9", 99.9)):
+                row[f"{name} {label}"] = round(1e6 * float(np.percentile(times, q)), 1)
+        if self.commands:
+            row |= {"off median": float(f"{np.median(off):.1e}"), "off max": float(f"{off.max():.1e}")}
+        return row
+
+
+def scenario(N: int, t_end: float, **changes: Any) -> Any:
+    """The paper's plant and fault with this horizon."""
+    values = {"N_p": N, "N_c": N} | changes
+    overrides = [f"controller.mpc.{key}={value}" for key, value in values.items()]
+    return load(CONFIG, ["simulation.h=0.01", f"simulation.t_end={t_end}", "event.0.t=0.3", *overrides])
+
+
+def prepared(N: int, t_end: float, **changes: Any) -> tuple[Simulation, Any]:
+    """A simulation at its start, and its controller's solver."""
+    chosen = scenario(N, t_end, **changes)
+    simulation = Simulation(chosen.system, chosen.settings, chosen.changes, chosen.controllers)
+    return simulation, simulation.sessions["mpc"]
+
+
+class Recorder:
+    """Notes what a solver is asked and what it answers."""
+
+    def __init__(self, solver: Any) -> None:
+        self.solver, self.asked, self.answers = solver, [], []
+
+    def solve(self, sample: Sample, u_last: np.ndarray) -> Any:
+        solution = self.solver.solve(sample, u_last)
+        self.asked.append((sample, u_last.copy()))
+        self.answers.append(float(solution.u[0, 0]))
+        return solution
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.solver, name)
+
+
+def sequence(N: int, t_end: float) -> tuple[list[tuple[Sample, np.ndarray]], np.ndarray]:
+    """Samples of the closed loop under converged plans, and those plans' first commands."""
+    simulation, session = prepared(N, t_end, options='{mode="converged", max_iterations=100, tolerance=1e-8}')
+    session.solver = recorder = Recorder(session.solver)
+    simulation.run()
+    return recorder.asked, np.array(recorder.answers)
+
+
+def real_time_iteration(N: int, t_end: float, asked: Sequence[Any], passes: int) -> dict[str, Times]:
+    """Feedback alone, and feedback with preparation."""
+    _, session = prepared(N, t_end)
+    solver = session.solver
+    feedback, whole = Times(), Times()
+    for _ in range(passes):
+        solver.recall({"multipliers": np.zeros_like(solver.condensed.solver.memory())})
+        for sample, u_last in asked:
+            solution = feedback.measure(lambda s=sample, u=u_last: solver.solve(s, u))
+            preparation = Times()
+            preparation.measure(lambda s=solution: solver.prepare(s.u[0]))
+            whole.cpu.append(feedback.cpu[-1] + preparation.cpu[0])
+            whole.wall.append(feedback.wall[-1] + preparation.wall[0])
+            for times in (feedback, whole):
+                times.commands.append(float(solution.u[0, 0]))
+    return {"pgexcite, feedback": feedback, "pgexcite, preparation and feedback": whole}
+
+
+def exported(N: int, t_end: float, folder: Path, passes: int) -> dict[str, Times]:
+    """The exported C on its own replay."""
+    directory = export_c(scenario(N, t_end), folder / f"c{N}").directory
+    cc = codegen.compiler()
+    assert cc is not None
+    command = [cc, "-std=c99", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "mpc.c", "-o", "mpc.so", "-lm"]
+    subprocess.run(command, cwd=directory, check=True)
+    library = ctypes.CDLL(str(directory / "mpc.so"))
+    sizes = [int(n) for n in re.findall(r"MPC_N_[XZDUP] = (\d+)", (directory / "mpc.h").read_text())]
+    fields = [("t", ctypes.c_double), ("startup", ctypes.c_int)]
+    fields += [(key, ctypes.c_double * max(1, n)) for key, n in zip("xzdup", sizes, strict=True)]
+
+    class Input(ctypes.Structure):
+        _fields_ = (*fields, ("u_last", ctypes.c_double * 1))
+
+    output = (ctypes.c_double * 8)()
+    inputs = []
+    for line in (directory / "replay.txt").read_text().splitlines():
+        numbers = [float(word) for word in line.split()]
+        item, at = Input(), 2
+        item.t, item.startup = numbers[0], int(numbers[1])
+        for key, n in zip("xzdup", sizes, strict=True):
+            getattr(item, key)[:n] = numbers[at : at + n]
+            at += n
+        item.u_last[0] = numbers[at]
+        inputs.append(item)
+    feedback, whole = Times(), Times()
+    for _ in range(passes):
+        library.mpc_reset()
+        for item in inputs:
+            feedback.measure(lambda i=item: library.mpc_step(ctypes.byref(i), output))
+            preparation = Times()
+            preparation.measure(lambda: library.mpc_prepare(output))
+            whole.cpu.append(feedback.cpu[-1] + preparation.cpu[0])
+            whole.wall.append(feedback.wall[-1] + preparation.wall[0])
+    return {"exported C, feedback": feedback, "exported C, preparation and feedback": whole}
+
+
+def slsqp(N: int, t_end: float, asked: Sequence[Any]) -> dict[str, Times]:
+    """Single shooting with finite differences on the compiled prediction."""
+    _, session = prepared(N, t_end)
+    shooting = session.solver
+    model, problem, condensed = shooting.kernel.model, shooting.problem, shooting.condensed
+    outputs = [model.position("y", path) for path in condensed.outputs()]
+    predictor = Predictor(shooting.kernel, [model.position("u", COMMAND)], outputs, N, shooting.rule)
+    times, plan = Times(), None
+    for sample, u_last in asked:
+        state = sample.state
+        horizon = shooting.horizons.at(sample.t, state.u, sample.p)
+        references = problem.references(sample.t)
+
+        def cost(u: np.ndarray, *, s: Any = state, ho: Any = horizon, re: Any = references, ul: Any = u_last) -> float:
+            rollout = predictor.roll(s, u[:, None], ho, derivatives=False)
+            return 1e6 if rollout is None else condensed.cost(rollout.y, re, u[:, None], ul)
+
+        start = np.tile(u_last, N) if plan is None else np.append(plan[1:], plan[-1])
+        bounds = [(problem.u_min[0], problem.u_max[0])] * N
+        found = times.measure(lambda c=cost, s=start, b=bounds: minimize(c, s, method="SLSQP", bounds=b))
+        plan = np.clip(found.x, problem.u_min[0], problem.u_max[0])
+        times.commands.append(float(plan[0]))
+    return {"scipy SLSQP": times}
+
+
+def ordinary(simulation: Simulation) -> tuple[ca.SX, ca.SX, ca.SX, list[ca.SX]]:
+    """The plant as ordinary differential equations: moving states, command, fault status, and (x', v_t, omega).
+
+    The algebraic equations are linear in their unknowns here, so they are solved symbolically; that is checked.
+    """
+    model, state, p_0 = simulation.model, simulation.initial.state, simulation.initial.p
+    moving = [k for k in range(len(model.x_names)) if not model.inert[k]]
+    x, u, fault = ca.SX.sym("x", len(moving)), ca.SX.sym("u"), ca.SX.sym("fault")
+    X, U, P = ca.SX(state.x), ca.SX(state.u), ca.SX(p_0)
+    for row, k in enumerate(moving):
+        X[k] = x[row]
+    U[model.position("u", COMMAND)] = u
+    P[model.position("p", FAULT)] = fault
+    Z, d = ca.SX.sym("z", len(model.z_names)), ca.SX(state.d)
+    f, mass, _, _, g, _, y = model.dae(X, Z, d, U, P, 0.0)
+    slope = ca.simplify(ca.jacobian(g, Z))
+    assert not ca.depends_on(slope, Z), "the algebraic equations are not linear"
+    solved = -ca.solve(slope, ca.substitute(g, Z, 0))
+    f, y = (ca.substitute(e, Z, solved) for e in (f / mass, y))
+    return x, u, fault, [f[moving], y[model.position("y", "unit.G2.v_t")], y[model.position("y", "unit.G2.omega")]]
+
+
+def do_mpc(N: int, t_end: float, asked: Sequence[Any], folder: Path) -> dict[str, Times]:
+    """do-mpc as its documentation sets it up; then the same with its program compiled, where that works."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(sys.stderr):
+        warnings.simplefilter("ignore")
+        import do_mpc as library
+
+        return {
+            name: _do_mpc(library, N, t_end, asked, folder if compiled else None)
+            for name, compiled in (("do-mpc as shipped", False), ("do-mpc, program compiled", True))
+        }
+
+
+def _do_mpc(library: Any, N: int, t_end: float, asked: Sequence[Any], compile_in: Path | None) -> Times:
+    simulation, session = prepared(N, t_end)
+    problem = session.solver.problem
+    sx, su, sfault, expressions = ordinary(simulation)
+    model = library.model.Model("continuous", "SX")
+    x = model.set_variable("_x", "x", shape=(sx.numel(), 1))
+    u = model.set_variable("_u", "u")
+    fault = model.set_variable("_tvp", "fault")
+    slope, v_t, omega = ca.substitute(expressions, [sx, su, sfault], [x, u, fault])
+    model.set_rhs("x", slope)
+    cost = float(problem.Q[0]) * (float(problem.V_ref[0]) - v_t) ** 2 + float(problem.P[0]) * (1 - omega) ** 2
+    model.set_expression("cost", cost)
+    model.setup()
+    mpc = library.controller.MPC(model)
+    mpc.settings.n_horizon, mpc.settings.t_step = N, problem.dt
+    mpc.settings.supress_ipopt_output()
+    mpc.set_objective(lterm=model.aux["cost"], mterm=model.aux["cost"])
+    mpc.set_rterm(u=float(problem.R[0]))
+    mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = float(problem.u_min[0]), float(problem.u_max[0])
+    template, now = mpc.get_tvp_template(), [0.0]
+
+    def known(_: float) -> Any:
+        template["_tvp", :, "fault"] = now[0]
+        return template
+
+    mpc.set_tvp_fun(known)
+    mpc.setup()
+    if compile_in is not None:
+        where = compile_in / f"nlp{N}"
+        # Its optimizer module uses a name it does not import (5.1.2): nothing else is changed.
+        library.optimizer.nlpsol = ca.nlpsol
+        with contextlib.chdir(compile_in):
+            mpc.compile_nlp(
+                overwrite=True, cname=f"nlp{N}.c", libname=f"{where}.so", compiler_command=_compile(N, where)
+            )
+    moving = ~simulation.model.inert
+    position = simulation.model.position("p", FAULT)
+    times = Times()
+    for k, (sample, u_last) in enumerate(asked):
+        x_0 = sample.state.x[moving][:, None]
+        now[0] = float(sample.p[position])
+        mpc.u0 = u_last[:, None]
+        if k == 0:
+            mpc.x0 = x_0
+            mpc.set_initial_guess()
+        found = times.measure(lambda v=x_0: mpc.make_step(v))
+        times.commands.append(float(found[0, 0]))
+    return times
+
+
+def _compile(N: int, where: Path) -> str:
+    return f"gcc -fPIC -shared -O1 nlp{N}.c -o {where}.so"
+
+
+def main() -> None:
+    """Measure and print a table and JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--horizons", type=int, nargs="+", default=[5, 10, 20])
+    parser.add_argument("--passes", type=int, default=30, help="of the fast solvers through the sequence")
+    parser.add_argument("--t-end", type=float, default=3.0)
+    told = parser.parse_args()
+    there = importlib.util.find_spec("do_mpc") is not None
+    rows = []
+    gc.freeze()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for N in told.horizons:
+            asked, reference = sequence(N, told.t_end)
+            found = real_time_iteration(N, told.t_end, asked, told.passes)
+            found |= exported(N, told.t_end, folder, told.passes)
+            found |= slsqp(N, told.t_end, asked)
+            found |= do_mpc(N, told.t_end, asked, folder) if there else {}
+            rows += [{"N": N, "solver": solver, **times.row(reference)} for solver, times in found.items()]
+    about = {"machine": f"{platform.machine()}, {os.cpu_count()} processors", "load": os.getloadavg(), "rows": rows}
+    print(json.dumps(about, indent=1))
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    print("| " + " | ".join(keys) + " |\n|" + "---|" * len(keys))
+    for row in rows:
+        print("| " + " | ".join(str(row.get(key, "")) for key in keys) + " |")
+
+
+if __name__ == "__main__":
+    main()
