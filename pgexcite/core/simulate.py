@@ -409,7 +409,8 @@ class Simulation:
             memory[f"instruments:{name}"] = r.instruments.memory()
             memory[f"active:{name}"] = np.array(float(r.active))
         memory["low"] = self._low.elapsed
-        memory["applied"] = np.array(len(self._changes) - len(self._pending))
+        here = sum(self._boundary(change) == self.state.k for change in self._changes)
+        memory["applied_here"] = np.array(here - sum(self._boundary(change) == self.state.k for change in self._pending))
         self.state.save(path, self.model, self.p, memory)
 
     def resume(self, path: Path) -> None:
@@ -428,7 +429,9 @@ class Simulation:
             running.session.recall(own)
             running.instruments.recall(memory[f"instruments:{name}"])
             running.active = bool(memory[f"active:{name}"] > 0)
-        self._pending = self._changes[int(memory["applied"]) :]
+        here = [change for change in self._changes if self._boundary(change) == self.state.k]
+        later = [change for change in self._changes if self._boundary(change) > self.state.k]
+        self._pending = here[int(memory["applied_here"]) :] + later
         self._low.elapsed = memory["low"].copy()
         self._recording = _Recording()
         self._record_point()

@@ -209,7 +209,6 @@ def test_a_sample_time_that_is_no_multiple_of_the_step(dt):
 # Snapshots.
 
 
-@pytest.mark.xfail(strict=True, reason="resume counts the events of the saved run instead of looking at their times")
 def test_resume_takes_up_other_events(tmp_path):
     """A point of one run is the start of another: what lies before it is past, what lies behind it is to come."""
     first = simulation()
