@@ -22,6 +22,7 @@ from pgexcite.core.model import Model, State
 from pgexcite.core.result import ControllerStatistics, RunResult
 from pgexcite.core.settings import Settings
 from pgexcite.core.step import Kernel
+from pgexcite.core.synchronism import RotorAngles
 from pgexcite.core.system import System
 from pgexcite.core.trace import Ending, LogEntry, Outcome, Trace
 from pgexcite.core.undervoltage import Undervoltage
@@ -103,7 +104,7 @@ class Simulation:
         self.kernel = Kernel(self.model, self.initial.state, self.initial.p, settings.compile)
         self._controllers = dict(controllers or {})
         self._healthy = smallest_singular_value(self.kernel, self.initial.state, self.initial.p)
-        self._angles = _Angles(self.model)
+        self._angles = RotorAngles(self.model)
         self.restart(changes)
 
     def restart(self, changes: Sequence[Change] | None = None) -> None:
@@ -222,6 +223,7 @@ class Simulation:
         segment = self.kernel.advance(before, self.p, self.settings.rule, self.settings.h, n)
         done = segment.x.shape[0]
         t: Array = np.arange(before.k + 1, before.k + 1 + done, dtype=np.float64) * self.settings.h
+        self._angles.follow(self.p)
         lost = self._angles.first_beyond(segment.x, segment.y, self.settings.delta_max_deg)
         low = self._low.watch(segment.y)
         rows = [found[0] + 1 for found in (lost, low) if found is not None]
@@ -410,7 +412,9 @@ class Simulation:
             memory[f"active:{name}"] = np.array(float(r.active))
         memory["low"] = self._low.elapsed
         here = sum(self._boundary(change) == self.state.k for change in self._changes)
-        memory["applied_here"] = np.array(here - sum(self._boundary(change) == self.state.k for change in self._pending))
+        memory["applied_here"] = np.array(
+            here - sum(self._boundary(change) == self.state.k for change in self._pending)
+        )
         self.state.save(path, self.model, self.p, memory)
 
     def resume(self, path: Path) -> None:
@@ -454,37 +458,3 @@ def _nearest(model: Model, path: str) -> str:
 
     near = get_close_matches(path, (*model.u_names, *model.p_names, *model.y_names), n=3)
     return f"nearest: {', '.join(near)}" if near else ""
-
-
-class _Angles:
-    """Rotor angles against the infinite bus, or the centre of inertia where there is none."""
-
-    def __init__(self, model: Model) -> None:
-        machines = [d for d in model.system.devices if "machine" in d.components]
-        self.names = [d.path for d in machines]
-        self.columns = np.array([model.position("y", f"{d.path}.delta") for d in machines], dtype=int)
-        inertia = np.array([float(getattr(d.components["machine"], "H", 0.0)) * d.S_n for d in machines])
-        fixed = [
-            d.path for d in model.system.devices if d.components and next(iter(d.components.values())).role == "source"
-        ]
-        self._theta = [model.position("x", f"{path}.theta") for path in fixed if f"{path}.theta" in model.index["x"]][
-            :1
-        ]
-        self._fixed = bool(fixed) or bool(np.any(inertia == 0)) or not machines
-        self._weights = inertia / inertia.sum() if not self._fixed else None
-
-    def first_beyond(self, x: Array, y: Array, limit_deg: float) -> tuple[int, str, float] | None:
-        """First sample at which a machine is out of step: row, unit, angle in degrees."""
-        if not y.shape[0] or not self.columns.size:
-            return None
-        angles = y[:, self.columns]
-        if self._weights is not None:
-            angles = angles - (angles @ self._weights)[:, None]
-        elif self._theta:
-            angles = angles - x[:, self._theta]
-        beyond = np.abs(angles) > np.radians(limit_deg)
-        if not beyond.any():
-            return None
-        row = int(np.argmax(beyond.any(axis=1)))
-        unit = int(np.argmax(np.abs(angles[row])))
-        return row, self.names[unit], float(np.degrees(angles[row, unit]))

@@ -67,6 +67,31 @@ def test_without_an_infinite_bus_the_centre_of_inertia_decides_whatever_the_refe
     assert from_centre[-1] > 180 > from_centre[:-1].max()
 
 
+def cut_off(t):
+    return [change for name in ("L3", "L4") for change in BranchTrip(type="line_trip", t=t, name=name).changes()]
+
+
+@pytest.mark.parametrize("reference", ["infinite_bus", "centre_of_inertia"])
+def test_an_island_that_drifts_away_from_the_infinite_bus_is_in_synchronism(reference):
+    sim = run(two_units(reference), cut_off(0.5))
+    assert sim.outcome.ending is Ending.COMPLETED
+    trace = sim.trace()
+    turned = np.degrees(trace["unit.G1.delta"] - trace["infinite_bus.grid.theta"])
+    assert np.abs(turned).max() > 360  # measured 942: the turbines give more than the load takes
+    assert np.abs(np.degrees(trace["unit.G1.delta"] - trace["unit.G2.delta"])).max() < 90
+
+
+def test_a_machine_lost_inside_an_island_is_named():
+    fault = Fault(type="fault", t=1.0, bus="B", duration=0.8).changes()
+    sim = run(two_units(), [*cut_off(0.5), *fault])
+    assert (sim.outcome.ending, sim.outcome.where) == (Ending.LOST_SYNCHRONISM, "unit.G2")
+
+
+def test_a_machine_by_itself_cannot_lose_synchronism():
+    trips = [change for name in ("L1", "L2") for change in BranchTrip(type="line_trip", t=0.5, name=name).changes()]
+    assert run(two_units(), trips, t_end=1.0).outcome.ending is Ending.COMPLETED
+
+
 def test_a_fault_that_never_clears():
     sim = run(kobbelv(), Fault(type="fault", t=0.1, bus="HV").changes())
     assert sim.outcome.ending is Ending.LOST_SYNCHRONISM
