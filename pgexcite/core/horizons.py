@@ -72,6 +72,14 @@ class Horizons:
             u=np.array(us),
         )
 
+    def until(self, t: float, u: Array, p: Array) -> tuple[Array, Array]:
+        """Commands and parameters in force at ``t``, from those at the start of the run and the changes that are known."""
+        u = self._fixed(u)
+        for change in self.problem.known:
+            if self._instant(change) <= t + _SAME_INSTANT:
+                u, p = self._changed(u, p, change)
+        return u, p
+
     def _instant(self, change: Change) -> float:
         return float(np.ceil(change.t / self.grid - 1e-6) * self.grid)
 

@@ -82,6 +82,24 @@ class Rollout:
     dx: Array | None = None
 
 
+@dataclass(frozen=True)
+class Transition:
+    """Consecutive steps linearised: where they end, and how that depends on where they begin and on the commands.
+
+    Attributes:
+        x, y: states and selected outputs at the end, shapes ``(n_x,)`` and ``(n_y,)``.
+        A, B: derivatives of ``x`` to the states at the beginning and to the commands, shapes ``(n_x, n_x)`` and ``(n_x, n_u)``.
+        C, D: derivatives of ``y`` to the states at the end and to the commands, shapes ``(n_y, n_x)`` and ``(n_y, n_u)``.
+    """
+
+    x: Array
+    y: Array
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+
 class Predictor:
     """Rolls the kernel's step out under a sequence of moves.
 
@@ -166,6 +184,36 @@ class Predictor:
             return Rollout(y, dy.transpose(0, 2, 1))
         chained = self._condense(horizon.sample_moves, dy, dx)
         return Rollout(y, chained[:, :, n_x:], chained[:, :, :n_x])
+
+    def transition(self, state: State, p: Array, count: int, h: float) -> Transition | None:
+        """Linearise ``count`` steps of ``h`` seconds with everything but the state as it is; needs ``transitions=True``.
+
+        Returns:
+            The transition, or ``None`` where the model cannot be stepped.
+        """
+        kernel, (columns, n_x), n_y = self._kernel, (self._S.shape[0], self._x.size), self._outputs.size
+        segment = kernel.advance(state, p, self._rule, h, count)
+        y, dy, dx = np.zeros((1, n_y)), np.zeros((1, columns, n_y)), np.zeros((1, columns, n_x))
+        roll = self._roll if self._library is None else self._roll_compiled
+        horizon = Horizon.plain(count, h, [0], state, p)
+        if segment.failed or not roll(state, np.ascontiguousarray(state.u[self._commands][None]), horizon, y, dy, dx):
+            return None
+        y, C, D = self.outputs(segment.state, p)
+        A, B = dx[0, :n_x].T.copy(), dx[0, n_x:].T.copy()
+        if not (np.isfinite(dx).all() and np.isfinite(C).all()):
+            return None
+        return Transition(segment.state.x, y, A, B, C, D)
+
+    def outputs(self, state: State, p: Array) -> tuple[Array, Array, Array]:
+        """Selected outputs at a point and their derivatives to the states and to the commands; needs ``transitions=True``."""
+        n_x = self._x.size
+        self._kernel.begin(state, p)
+        self._S[:], self._S_c[:] = 0.0, 0.0
+        self._point_at(0, fresh=True)
+        self._sense_settling()
+        self._output.trigger()
+        slope = self._S_y.T.copy()
+        return self._y.copy(), slope[:, :n_x], slope[:, n_x:]
 
     def _roll_compiled(self, state: State, moves: Array, horizon: Horizon, y: Array, dy: Array, dx: Array) -> bool:
         assert self._library is not None
