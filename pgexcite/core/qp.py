@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 _EPS = 1e-10
 _GAP = 1e-8
-_WIDE = 1e20
+WIDE = 1e20
 _MAX_ITERATIONS = 60
 _MAX_INNER_ITERATIONS = 60
 
@@ -83,13 +83,13 @@ class QuadraticProgram:
     ) -> QPSolution:
         """Solve; never raises on bad numbers: an unusable input or an uncapped iteration gives ``solved = False``."""
         n, m = self._n, self._m
-        if not _usable(H, g, lower, upper, rows, rows_lower, rows_upper):
+        if not usable(H, g, lower, upper, rows, rows_lower, rows_upper):
             return QPSolution(np.zeros(n), np.zeros(m + n), False, 0)
         if m:
             self._rows[:m], self._low[:m], self._high[:m] = rows, rows_lower, rows_upper
         self._low[m:], self._high[m:] = lower, upper
         # Bounds that do not exist are large numbers to ProxQP, not infinities.
-        low, high = np.maximum(self._low, -_WIDE), np.minimum(self._high, _WIDE)
+        low, high = np.maximum(self._low, -WIDE), np.minimum(self._high, WIDE)
         self._qp.init(H, g, None, None, self._rows, low, high)
         self._qp.solve(np.zeros(n), self._no_equality, self._multipliers)
         results = self._qp.results
@@ -100,7 +100,7 @@ class QuadraticProgram:
         return QPSolution(np.clip(x, lower, upper), z, solved, int(results.info.iter))
 
 
-def _usable(
+def usable(
     H: Array,
     g: Array,
     lower: Array,
