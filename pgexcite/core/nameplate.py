@@ -1,6 +1,6 @@
 """A controller's own model of the grid: the nameplate data, with whatever is known or believed to be different.
 
-It is assembled from the same components as the plant, so that a mismatch is another parameter, never a second copy of the equations.
+It is assembled from the same components as the plant: a mismatch is another parameter, never a second copy of the equations.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from pgexcite.core import registry
-from pgexcite.core.config.checks import adjustable
+from pgexcite.core.config.checks import adjustable, siblings
 from pgexcite.core.config.validate import Collector
 from pgexcite.core.controller import Surroundings
 from pgexcite.core.errors import ConfigError
@@ -51,7 +51,9 @@ def overridden(system: System, overrides: Mapping[str, float], where: str) -> Sy
             owner, name = path.rpartition(".")[0], targets[path][1]
             changed.setdefault(owner, {})[name] = value
         else:
-            collect.add(f"{where}.{path}", "there is no such parameter", value, registry.nearest(path, targets))
+            collect.add(
+                f"{where}.{path}", "there is no such parameter", value, registry.nearest(path, siblings(path, targets))
+            )
     records = {path.rpartition(".")[0]: record for path, (record, _) in targets.items()}
     fresh: dict[str, Any] = {}
     for owner, values in changed.items():

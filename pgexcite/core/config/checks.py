@@ -127,7 +127,7 @@ def adjustable(system: System) -> dict[str, tuple[BaseModel, str] | None]:
 def _check_parameter_step(event: ParameterStep, where: str, system: System, collect: Collector) -> None:
     targets = adjustable(system)
     if event.path not in targets:
-        hint = registry.nearest(event.path, _siblings(event.path, targets))
+        hint = registry.nearest(event.path, siblings(event.path, targets))
         collect.add(f"{where}.path", "there is no such parameter or set-point", event.path, hint)
         return
     target = targets[event.path]
@@ -141,7 +141,7 @@ def _check_parameter_step(event: ParameterStep, where: str, system: System, coll
         collect.add(f"{where}.value", f"{event.path} {problem.message}", event.value, problem.hint)
 
 
-def _siblings(path: str, targets: Mapping[str, object]) -> list[str]:
+def siblings(path: str, targets: Mapping[str, object]) -> list[str]:
     """Targets that share the longest leading part of a path, so that the list offered is a short one."""
     parts = path.split(".")
     for count in range(len(parts) - 1, 0, -1):
