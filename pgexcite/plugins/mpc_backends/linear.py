@@ -1,0 +1,319 @@
+"""Linear MPC on a model of the controller's own, with estimated states and disturbances: offset-free without a perfect model.
+
+G. Pannocchia, J. B. Rawlings, "Disturbance models for offset-free model-predictive control", AIChE Journal 49 (2003) 426-437.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from pgexcite.core import qp_by_name
+from pgexcite.core.condensed import Condensed, Linearised
+from pgexcite.core.controller import Plant, Sample, Surroundings, as_arrays
+from pgexcite.core.declare import par
+from pgexcite.core.errors import ConfigError, Problem
+from pgexcite.core.horizons import Horizons
+from pgexcite.core.local import LocalModel
+from pgexcite.core.mpc import Problem as ControlProblem
+from pgexcite.core.mpc import Solution, Solver, Status
+from pgexcite.core.nameplate import own_model
+from pgexcite.core.offset_free import Disturbances, Noise, OffsetFreeFilter
+from pgexcite.core.prediction import Horizon, Predictor, Transition
+
+Array = NDArray[np.float64]
+Disturbed = Literal["v_t", "p_e", "q_e", "i_fd", "torque"]
+
+_SIGNALS = ("v_t", "omega", "p_e", "q_e", "i_fd")
+"""What the filter takes from a unit's terminals; the field voltage is an input of the model."""
+_ABSURD = 1e3
+"""A measurement beyond this, pu, says that an instrument is broken: it is neither believed nor taken for a lost one."""
+
+
+class Linear(BaseModel):
+    """Linear MPC with a Kalman filter, on the grid's nameplate data and the unit's own measurements.
+
+        measured --> [ Kalman filter: states, disturbances d ] --> y = linear model + d --> [ QP ] --> plan
+                               ^ command in force                       ^ linearised at the initial point or at the estimate
+
+    The model is the grid as configured, with ``model`` for what is different in it; it is assembled, initialised and linearised
+    like the plant, but never sees it. Commands and measurements count from the initial point, the plant's from the plant's and the
+    model's from the model's: a model that needs another field voltage for the same terminals starts without an error.
+
+    Disturbances are constant over the horizon. Those of outputs are added to them, ``"torque"`` is one of the turbine's and moves
+    the speed. Left out, they are chosen so that whatever can differ at rest has one: voltages, reactive power, torque, and the
+    field current unless the field voltage is what is commanded (at rest the two are equal, whatever the machine). Their drift
+    against ``sigma`` says how fast they follow: with the defaults almost at once; with noisy instruments give ``sigma`` and
+    ``sigma_omega`` as they are, and a ``drift`` well below ``sigma`` for a quiet field voltage.
+
+    With ``relinearise = "once"`` the model is that of the initial point, with ``"scheduled"`` it is made anew at the estimated
+    state every ``every`` samples, with ``"every"`` in each.
+
+    Not modelled: a limit inside the model (a ceiling, a non-windup limit) is as it stands at the point of linearisation; discrete
+    states stay as at the initial point; measurements are taken for fresh, whatever their delay.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    information: ClassVar[Literal["measured"]] = "measured"
+    source: ClassVar[str] = "G. Pannocchia, J. B. Rawlings, AIChE Journal 49 (2003) 426-437"
+
+    model: Mapping[str, float] = Field(
+        default_factory=dict, description="parameters of its own model that are not the nameplate's, by path"
+    )
+    relinearise: Literal["once", "scheduled", "every"] = par("every", "-", "when the model is linearised")
+    every: int = par(10, "-", "samples between two linearisations that are scheduled", ge=1)
+    disturbances: tuple[Disturbed, ...] | None = Field(
+        None, description="what constant disturbances are estimated for; chosen by the command where left out"
+    )
+    solver: str = Field("proxqp", description="name of the QP solver, as qpsolvers has it")
+    sigma: float = par(1e-3, "pu", "deviation of measured voltages, currents and powers that the filter assumes", gt=0)
+    sigma_omega: float = par(1e-5, "pu", "deviation of measured speeds that the filter assumes", gt=0)
+    sigma_state: float = par(1e-4, "pu", "noise of each state in a sample", gt=0)
+    sigma_field: float = par(1e-2, "pu", "noise of the command in a sample", ge=0)
+    sigma_torque: float = par(0.1, "pu", "noise of the torque in a sample: what is not known of the network", ge=0)
+    drift: float = par(1e-2, "pu", "change of a disturbance of an output in a sample", gt=0)
+    drift_torque: float = par(1e-2, "pu", "change of a disturbance of a torque in a sample", gt=0)
+
+    @field_validator("solver")
+    @classmethod
+    def _known_solver(cls, name: str) -> str:
+        if why := qp_by_name.objection(name):
+            raise ValueError(why)
+        return name
+
+    def start(self, problem: ControlProblem, surroundings: Surroundings, plant: Plant | None) -> Solver:
+        """Begin a run; a plant is not looked at.
+
+        Raises:
+            ConfigError: an override of the model is not valid, or the measurements cannot tell the disturbances apart.
+            InitialisationError: the model has no steady state at the operating point as configured.
+        """
+        return _Linear(self, problem, surroundings)
+
+
+class _Linear:
+    """The backend in one run.
+
+    Attributes:
+        filter: what it believes.
+    """
+
+    _plan: Array | None
+    _since: Array | None  # when the sample before this one was, and whether it was in charge
+    _u: Array  # the plant's commands in force since then
+    _age: int  # samples since the model was linearised
+
+    def __init__(self, options: Linear, problem: ControlProblem, surroundings: Surroundings) -> None:
+        self.options, self.problem = options, problem
+        initial, kernel = own_model(surroundings, options.model, "options.model")
+        model = initial.model
+        self.condensed = Condensed(problem, qp_by_name.NamedSolver(options.solver))
+        units = [path.rpartition(".")[0] for path in problem.speeds]
+        at_terminals = [f"{unit}.{signal}" for unit in units for signal in _SIGNALS]
+        self._measured = list(dict.fromkeys([*at_terminals, *problem.voltages]))
+        outputs = list(dict.fromkeys([*self._measured, *self.condensed.outputs()]))
+        self._predicted = [outputs.index(path) for path in self.condensed.outputs()]
+        self._commands = [model.position("u", path) for path in problem.commands]
+        self._horizons = Horizons(model, problem, surroundings.h, surroundings.h)
+        self._u_0, self._p_0 = initial.state.u, initial.p
+        u, p = self._horizons.until(0.0, self._u_0, self._p_0)
+        self._point_0 = kernel.settle(initial.state.with_(u=u), p) or initial.state
+        positions = [model.position("y", path) for path in outputs]
+        predictor = Predictor(kernel, self._commands, positions, problem.N_c, surroundings.rule, transitions=True)
+        self._local = LocalModel(kernel, self._commands, predictor, self._point_0)
+        self._y_0, self._C_0, _ = predictor.outputs(self._point_0, p)
+        # The plant minus the model at the initial point; nobody tells what is not measured.
+        self._u_bias = np.array([surroundings.u_0[path] for path in problem.commands]) - u[self._commands]
+        told = [surroundings.y_0[path] if path in self._measured else np.nan for path in outputs]
+        self._y_bias = np.where(np.isfinite(told), told - self._y_0, 0.0)
+        speeds = [model.position("x", f"{unit}.machine.omega") for unit in units]
+        moving = (kernel.mass > 0) & ~model.inert
+        self.filter = self._make_filter(outputs, units, speeds, kernel.mass[speeds], moving)
+        if confused := self.filter.confused(self._first()):
+            text = f"the measurements cannot tell {', '.join(confused)} apart at rest; leave one of them out"
+            raise ConfigError([Problem("options.disturbances", text, list(self._disturbances()))])
+        self.recall({})
+
+    def _make_filter(
+        self,
+        outputs: Sequence[str],
+        units: Sequence[str],
+        speeds: Sequence[int],
+        mass: Array,
+        moving: NDArray[np.bool_],
+    ) -> OffsetFreeFilter:
+        """The filter; ``speeds`` are the positions of the units' speeds among the states, ``mass`` their coefficients."""
+        options, chosen = self.options, self._disturbances()
+        disturbed = [
+            path
+            for path in self._measured
+            if path.rpartition(".")[2] in chosen or (path in self.problem.voltages and "v_t" in chosen)
+        ]
+        where = np.array([path == name for path in outputs for name in disturbed], dtype=float)
+        # Half of the speed gained over a sample is there on the average: (I + A) / 2 gives the angle its share.
+        gained = (np.eye(moving.size) + self._first().A)[:, speeds] / 2 * (self.problem.dt / mass)
+        disturbances = Disturbances(
+            names=(*disturbed, *(f"{unit}.torque" for unit in units if "torque" in chosen)),
+            outputs=where.reshape(len(outputs), len(disturbed)),
+            torques=gained,
+            estimated="torque" in chosen,
+        )
+        slow = np.array([path.endswith(".omega") for path in self._measured])
+        noise = Noise(
+            measured=np.where(slow, options.sigma_omega, options.sigma),
+            state=np.where(moving, options.sigma_state, 0.0),
+            command=options.sigma_field,
+            torque=options.sigma_torque,
+            drift=options.drift,
+            drift_torque=options.drift_torque,
+        )
+        rows = np.array([outputs.index(path) for path in self._measured])
+        return OffsetFreeFilter(disturbances, noise, rows, self._point_0.x)
+
+    def _disturbances(self) -> tuple[Disturbed, ...]:
+        if self.options.disturbances is not None:
+            return self.options.disturbances
+        drives_field = all(path.rpartition(".")[2].startswith("e_fd") for path in self.problem.commands)
+        return ("v_t", "q_e", "torque") if drives_field else ("v_t", "q_e", "i_fd", "torque")
+
+    def _first(self) -> Transition:
+        """A sample from the initial point."""
+        step = self._local.sample(self._horizon(0.0), self._point_0.x, self._point_0.u[self._commands])
+        if step is None:
+            raise ConfigError([Problem("options.model", "this model cannot be stepped at its own operating point")])
+        return step
+
+    def _horizon(self, t: float) -> Horizon:
+        return self._horizons.at(t, *self._horizons.until(t, self._u_0, self._p_0))
+
+    # The protocol of a solver.
+
+    def solve(self, sample: Sample, u_last: Array) -> Solution:
+        """The plan from this sample on; see ``pgexcite.core.mpc.Solver``."""
+        began = time.perf_counter()
+        known = self._observe(sample, u_last)
+        located = time.perf_counter()
+        if known:
+            self._linearise(u_last)
+            solution = self._planned(sample.t, u_last)
+        else:
+            solution = self._failed(Status.STATE_UNKNOWN, u_last)
+        self._since, self._u = np.array([sample.t, float(sample.active)]), u_last
+        times = {"locate": 1e3 * (located - began), "feedback": 1e3 * (time.perf_counter() - located)}
+        return replace(solution, times_ms=times, diagnostics=self._diagnostics())
+
+    def prepare(self, u: Array) -> None:
+        """Keep what was sent: it is in force until the next sample."""
+        if not self.problem.delayed:
+            self._u = u
+
+    def memory(self) -> Mapping[str, Array]:
+        """Estimate, plan, and the point of linearisation."""
+        point = {f"point:{name}": getattr(self._local.point, name) for name in ("x", "z", "u")}
+        believed = {f"filter:{name}": value for name, value in self.filter.memory().items()}
+        maybe = {"plan": self._plan, "since": self._since}
+        kept = {"u": self._u, "age": self._age, **{key: value for key, value in maybe.items() if value is not None}}
+        return as_arrays(kept) | believed | point
+
+    def recall(self, memory: Mapping[str, Array]) -> None:
+        """Take up where ``memory`` left off; from the initial point where it is empty."""
+        start = "filter:"
+        self.filter.recall({k.removeprefix(start): v for k, v in memory.items() if k.startswith(start)})
+        self._local.move(self._point_0.with_(**{name: memory[f"point:{name}"] for name in ("x", "z", "u") if memory}))
+        self._plan, self._since = memory.get("plan"), memory.get("since")
+        self._u = memory.get("u", self._point_0.u[self._commands] + self._u_bias)
+        self._age = int(memory.get("age", 0))
+
+    # Where the model is.
+
+    def _observe(self, sample: Sample, u_last: Array) -> bool:
+        """Predict to this sample and correct by what was measured; whether the state is known now."""
+        y, C = self._y_0, self._C_0
+        if self._since is not None:
+            began, in_charge = self._since
+            # On standby the command moves between two samples; both ends are known.
+            u = self._u if in_charge > 0 else (self._u + u_last) / 2
+            step = self._local.sample(self._horizon(float(began)), self.filter.x, u - self._u_bias, self.filter.push)
+            if step is None:
+                return False
+            self.filter.predict(step)
+            y, C = step.y, step.C
+        measured = np.array([sample.measured[path] for path in self._measured])
+        if np.nanmax(np.abs(measured), initial=0.0) > _ABSURD:
+            return False
+        self.filter.correct(measured, y + self._y_bias, C)
+        if not self.filter.sound:
+            self.recall({})
+            return False
+        return True
+
+    def _linearise(self, u_last: Array) -> None:
+        """Move the point of linearisation to the estimate, where it is time."""
+        self._age += 1
+        mode = self.options.relinearise
+        if mode == "every" or (mode == "scheduled" and self._age >= self.options.every):
+            self._age = 0
+            self._move(u_last - self._u_bias)
+
+    def _move(self, commands: Array) -> None:
+        u = self._local.point.u.copy()
+        u[self._commands] = commands
+        self._local.move(self._local.point.with_(x=self.filter.x, u=u))
+
+    # Planning.
+
+    def _failed(self, status: Status, u_last: Array) -> Solution:
+        hold = self.condensed.clipped(np.tile(u_last, (self.problem.N_c, 1)))
+        return Solution(status, hold, np.inf, 0, np.inf)
+
+    def _planned(self, t: float, u_last: Array) -> Solution:
+        at = self._prediction(t, u_last)
+        if at is None:
+            # The model cannot be stepped from the estimate: the initial point still serves.
+            self._local.move(self._point_0)
+            at = self._prediction(t, u_last)
+        elif not at.G.any():
+            # A limit of the model is met, where commands have no effect: around the initial commands they have.
+            self._move(self._point_0.u[self._commands])
+            at = self._prediction(t, u_last) or at
+        if at is None:
+            return self._failed(Status.PREDICTION_FAILED, u_last)
+        plan = self._guess(u_last)
+        found = self.condensed.direction(at, plan, u_last)
+        if found is None:
+            return self._failed(Status.QP_FAILED, u_last)
+        step, _ = found
+        self._plan = self.condensed.clipped(plan + step)
+        cost = self.condensed.cost(at.y + at.G @ step.ravel(), at.references, self._plan, u_last)
+        return Solution(Status.CONVERGED, self._plan, cost, 1, float(np.abs(step).max()))
+
+    def _guess(self, u_last: Array) -> Array:
+        """The plan that predictions are made around: the last one, a sample on."""
+        held = np.tile(u_last, (self.problem.N_c, 1))
+        return self.condensed.clipped(held if self._plan is None else self.problem.shifted(self._plan))
+
+    def _prediction(self, t: float, u_last: Array) -> Linearised | None:
+        x, push = self.filter.x, self.filter.push
+        if self.problem.delayed:
+            step = self._local.sample(self._horizon(t), x, u_last - self._u_bias, push)
+            if step is None:
+                return None
+            x, t = step.x, t + self.problem.dt
+        predicted = self._local.predict(self._horizon(t), x, self._guess(u_last) - self._u_bias, push)
+        if predicted is None:
+            return None
+        y, G = self.filter.disturbed(predicted[0] + self._y_bias), predicted[1]
+        return Linearised(y[:, self._predicted], G[:, self._predicted], self.problem.references(t))
+
+    def _diagnostics(self) -> dict[str, float]:
+        """What the filter believes, for the trace."""
+        several, believed = len(self.problem.speeds) > 1, {}
+        for path, value in self.filter.estimates.items():
+            believed[f"disturbance.{path if several else path.rpartition('.')[2]}"] = value
+        return believed | {"innovation": self.filter.surprise, "age": float(self._age)}
