@@ -8,7 +8,7 @@ import pytest
 from pgexcite import Simulation, load
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-SCENARIOS = sorted(path for path in CONFIGS.rglob("*.toml") if "cases" not in path.parts)
+SCENARIOS = sorted(path for path in CONFIGS.rglob("*.toml") if not {"cases", "studies"} & {*path.parts})
 
 
 def simulate(path, *overrides):
@@ -24,8 +24,9 @@ def test_a_scenario_ends_as_it_expects(path):
 
 
 @pytest.mark.parametrize(("begins", "ends"), [(1.0, 6.0), (6.0, 10.0)], ids=["up", "down"])
-def test_the_open_circuit_step_settles_fast_with_little_overshoot(begins, ends):
-    trace = simulate(CONFIGS / "smib" / "open_circuit_st1a.toml")[2]
+@pytest.mark.parametrize(("name", "overshoot"), [("st1a", 0.11), ("nmpc", 1e-3), ("linear", 1e-3)])
+def test_the_open_circuit_step_settles_fast_with_little_overshoot(name, overshoot, begins, ends):
+    trace = simulate(CONFIGS / "smib" / f"open_circuit_{name}.toml")[2]
     t, v = trace.t, trace["unit.G2.v_t"]
     before = v[np.searchsorted(t, begins) - 1]
     during = (t > begins) & (t < ends)
@@ -33,8 +34,8 @@ def test_the_open_circuit_step_settles_fast_with_little_overshoot(begins, ends):
     answer = (v[during] - before) / (final - before)
     outside = np.abs(answer - 1) > 0.05
     peak = int(np.argmax(answer))
-    assert t[during][outside][-1] - begins < 0.5  # measured 0.41 s to within 5 % of the step
-    assert answer[peak] - 1 < 0.15  # measured 0.10
+    assert t[during][outside][-1] - begins < 0.5  # measured 0.405 s to within 5 % of the step, all three
+    assert answer[peak] - 1 < overshoot  # measured 0.1007, 0 and 0; 0.15 is asked for
     assert answer[peak:].min() > 1 - 0.02  # measured 0.99: it does not swing back
     assert abs(final - before) == pytest.approx(0.05, rel=0.02)  # measured 0.0498: the regulator's droop
 
@@ -47,6 +48,12 @@ def test_the_clearing_scenarios_are_within_two_per_cent_of_losing_synchronism(na
     beyond = simulate(path, f"event.0.duration={t_crit + 0.002}")[1]
     assert beyond.ending.value == "lost_synchronism"
     assert beyond.where == "unit.G2"
+
+
+def test_a_fault_known_in_advance_swings_the_rotor_less():
+    runs = {name: simulate(CONFIGS / "smib" / f"fault_{name}.toml")[2] for name in ("nmpc", "nmpc_known")}
+    first_swing = {name: np.degrees(trace["unit.G2.delta"].max()) for name, trace in runs.items()}
+    assert first_swing["nmpc_known"] < first_swing["nmpc"] - 2.0  # measured 52.76 against 55.53
 
 
 def test_predictive_control_keeps_its_bounds_and_recovers_the_voltage_first():
