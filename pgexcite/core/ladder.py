@@ -7,6 +7,9 @@
 
 Every step down and up is in the log; the summary counts the samples in which a plan could not be used.
 
+A measurement counts as lost where a value is not finite or beyond anything a machine does, and where all of them stay the same to
+the last bit although the command has moved: the transmitter hangs.
+
 What it cannot see: a plan within its bounds, of finite cost, that is nevertheless wrong. Two seconds of random field voltages can
 cost a machine its synchronism.
 """
@@ -15,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +27,11 @@ from pgexcite.core.controller import Action, Sample, as_arrays
 from pgexcite.core.mpc import Problem, Solution, Solver, Status
 
 Array = NDArray[np.float64]
+
+_PLAUSIBLE = 1e3
+"""Largest measured value that is believed, pu."""
+_MOVED = 1e-6
+"""A command that moved by more than this moves what is measured."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,7 @@ class Ladder:
         self._plan = np.tile(u_0, (problem.N_c, 1))
         self._reused = 0
         self._stale = 0
+        self._seen: Array = np.empty(0)
         self._good = 0
         self._in_charge = False
         self._stepped_down = False
@@ -83,6 +92,7 @@ class Ladder:
     def act(self, sample: Sample) -> Action:
         """One sample: plan, judge the plan, command."""
         notes: list[str] = []
+        sample = _believed(sample)
         passed = self._passed(sample)
         self._take_bearings(sample)
         began = time.perf_counter()
@@ -110,13 +120,14 @@ class Ladder:
 
     def memory(self) -> Mapping[str, Array]:
         """All that is kept between samples."""
-        names = ("u", "move", "next", "plan", "reused", "stale", "good", "in_charge", "stepped_down")
+        names = ("u", "move", "next", "plan", "reused", "stale", "seen", "good", "in_charge", "stepped_down")
         own = as_arrays({name: getattr(self, f"_{name}") for name in names})
         return own | {f"solver:{key}": value for key, value in self.solver.memory().items()}
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
-        self._u, self._move, self._next, self._plan = (memory[name] for name in ("u", "move", "next", "plan"))
+        names = ("u", "move", "next", "plan", "seen")
+        self._u, self._move, self._next, self._plan, self._seen = (memory[name] for name in names)
         self._reused, self._stale, self._good = (int(memory[name]) for name in ("reused", "stale", "good"))
         self._in_charge, self._stepped_down = bool(memory["in_charge"] > 0), bool(memory["stepped_down"] > 0)
         start = "solver:"
@@ -135,8 +146,13 @@ class Ladder:
 
     def _take_bearings(self, sample: Sample) -> None:
         """How old the measurement is and, until in charge, what is in force."""
-        lost = not np.isfinite(list(sample.measured.values())).all()
-        self._stale = self._stale + 1 if lost else 0
+        values = np.array(list(sample.measured.values()))
+        lost = not np.isfinite(values).all()
+        # On standby the command stays where it is: a measurement once found to hang hangs until it moves.
+        moved = self._stale > 0 or bool(np.abs(self._move).max() > _MOVED)
+        hangs = moved and np.array_equal(values, self._seen)
+        self._seen = values
+        self._stale = self._stale + 1 if lost or hangs else 0
         if not (sample.active and self._in_charge) and self.actuator.feedback and not lost:
             in_force = np.array([sample.measured[path] for path in self.actuator.feedback])
             self._u = self._next = np.clip(in_force, self.problem.u_min, self.problem.u_max)
@@ -229,3 +245,9 @@ class Ladder:
         """The set-point on its way back to where it was before this controller moved it."""
         reach = self.options.return_rate * self.problem.dt
         return self._u + np.clip(self.u_0 - self._u, -reach, reach)
+
+
+def _believed(sample: Sample) -> Sample:
+    """A sample with NaN in place of what no instrument of a machine would show."""
+    measured = {path: value if abs(value) <= _PLAUSIBLE else np.nan for path, value in sample.measured.items()}
+    return replace(sample, measured=measured)
