@@ -90,9 +90,11 @@ def solve(system: System) -> PowerFlow:
     """Solve the power flow.
 
     Raises:
-        PowerFlowError: an island has no slack, the specification does not fit, or Newton fails; each problem names a bus.
+        PowerFlowError: an island has no slack, the specification does not fit, Newton fails, or a slack or a scheduled Q is beyond
+            its reactive limits; each problem names a bus or a device.
     """
     _check_islands(system)
+    _check_reactive(system, {d.path: d.schedule.Q for d in system.devices if d.schedule.Q is not None})
     names = list(system.buses)
     index = {name: k for k, name in enumerate(names)}
     held: dict[str, float] = {}
@@ -106,6 +108,8 @@ def solve(system: System) -> PowerFlow:
         s = _share(system, index, v * np.conj(y @ v), held)
         changed = _apply_limits(system, index, v, s, held)
         if not changed:
+            slack = [d.path for d in system.devices if d.schedule.angle is not None and d.schedule.Q is None]
+            _check_reactive(system, {path: s[path].imag * system.S_base for path in slack})
             return PowerFlow({name: complex(v[k]) for name, k in index.items()}, s, iterations, tuple(held))
     raise PowerFlowError(
         [
@@ -138,6 +142,21 @@ def _check_islands(system: System) -> None:
                     hint="connect it with a line or transformer, or set slack = true on one of its units",
                 )
             )
+    if problems:
+        raise PowerFlowError(problems)
+
+
+def _check_reactive(system: System, delivered: Mapping[str, float]) -> None:
+    """Refuse reactive powers (Mvar, by device) beyond the limits of devices that have no voltage to give up for them."""
+    problems = []
+    for path, Q in delivered.items():
+        plan = system.device(path).schedule
+        limit = min(max(Q, plan.Q_min), plan.Q_max)
+        if abs(limit - Q) > 1e-9 * max(1.0, abs(limit)):
+            name, side = ("Q_max", "above") if limit < Q else ("Q_min", "below")
+            what = "the slack delivers" if plan.Q is None else "is scheduled to deliver"
+            text = f"{what} {Q:.5g} Mvar, {side} its {name} = {limit:g} Mvar"
+            problems.append(Problem(path, text, hint="widen the limit or change Q, V or the slack"))
     if problems:
         raise PowerFlowError(problems)
 

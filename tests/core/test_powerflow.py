@@ -175,6 +175,28 @@ def test_limits_that_leave_no_unit_to_hold_the_voltage():
     assert list(found) == ["bus.B"]
 
 
+@pytest.mark.parametrize(("limit", "side"), [({"Q_max": -50.0}, "above"), ({"Q_min": 500.0}, "below")])
+def test_a_slack_beyond_its_reactive_limits_is_refused(limit, side):
+    system = two_units(grid=False)
+    tight = replace(system.devices[0], schedule=replace(system.devices[0].schedule, **limit))
+    found = problems(replace(system, devices=(tight, *system.devices[1:])))
+    assert list(found) == ["unit.G1"]
+    assert f"{side} its {next(iter(limit))}" in found["unit.G1"].message
+    wide = replace(tight, schedule=replace(tight.schedule, Q_min=-500.0, Q_max=500.0))
+    assert solve(replace(system, devices=(wide, *system.devices[1:]))).at_limit == ()
+
+
+def test_a_scheduled_reactive_power_outside_its_limits_is_refused():
+    devices = [
+        SLACK,
+        ("unit.1", "B", Schedule(P=10.0, Q=30.0, Q_max=20.0)),
+        ("unit.2", "B", Schedule(P=0, Q=-9, Q_min=-5)),
+    ]
+    found = problems(grid("AB", devices, [("A", "B", {"X": 0.1})]))
+    assert list(found) == ["unit.1", "unit.2"]
+    assert "scheduled to deliver 30 Mvar, above its Q_max = 20 Mvar" in found["unit.1"].message
+
+
 # Failures.
 
 
