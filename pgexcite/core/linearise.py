@@ -50,8 +50,8 @@ class Linearisation:
 
     Attributes:
         A, B, C, D: shapes ``(n, n)``, ``(n, n_u)``, ``(n_y, n)``, ``(n_y, n_u)``.
-        x_names: paths of the ``n`` states that are left: those with a time constant, not held at a limit, and not the angle of
-            the reference itself.
+        x_names: paths of the ``n`` states that are left: those with a time constant, not held at a limit, and not at rest
+            whatever happens (the angle of the reference itself).
         u_names, y_names: paths of commands and outputs.
         held: states held at a limit at this point.
     """
@@ -113,7 +113,9 @@ def linearise(model: Model, state: State, p: Array) -> Linearisation:
     for at, bound in ((at_upper, "upper"), (at_lower, "lower")):
         rows_f[at] = unit[at] - derivatives[bound][at]
     algebraic = at_upper | at_lower | (mass == 0)
-    dynamic = ~algebraic & ~model.inert
+    # With a mass that is a parameter (a reference machine with H = 0) a row may vanish at this point without doing so symbolically.
+    at_rest = (f == 0) & ~derivatives["f"].any(axis=1)
+    dynamic = ~algebraic & ~model.inert & ~at_rest
     n_w = n_x + len(model.z_names)
     solved = np.concatenate((algebraic, np.ones(n_w - n_x, dtype=bool)))
     moving = np.concatenate((dynamic, np.zeros(n_w - n_x, dtype=bool)))

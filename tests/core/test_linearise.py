@@ -15,8 +15,12 @@ from pgexcite.core.initialise import initialise
 from pgexcite.core.linearise import linearise
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
+from pgexcite.core.system import Device, Schedule
+from pgexcite.plugins.exciters.constant import ConstantField
 from pgexcite.plugins.exciters.st1a import ST1A
+from pgexcite.plugins.governors.constant import ConstantTorque
 from pgexcite.plugins.machines.classical import Classical
+from pgexcite.plugins.sources.infinite_bus import InfiniteBus
 
 
 def at_rest(system):
@@ -158,6 +162,28 @@ def test_the_reference_moves_no_mode():
         values = values[np.argsort(np.abs(values))][len(values) - len(expected) :]
         for value in expected:
             assert np.abs(values - value).min() < 1e-7, (reference, value)
+
+
+@pytest.mark.parametrize("reference", ["INF", "G1", "centre_of_inertia"])
+def test_a_machine_without_inertia_adds_no_modes(reference):
+    """The modes are those with an infinite bus behind its reactance, and where it is the reference itself nothing else."""
+    system = two_units(reference)
+
+    def ended(path, **components):
+        plan = Schedule(P=None, V=1.0, angle=0.0)
+        return replace(system, devices=(*system.devices[:3], Device(path, "INF", 100.0, components, plan)))
+
+    bus = replace(ended("infinite_bus.INF", **{"": InfiniteBus(X=0.01)}), reference="infinite_bus")
+    machine = {"machine": Classical(H=0.0, Xp_d=0.01), "exciter": ConstantField(), "governor": ConstantTorque()}
+    expected = linearise(*at_rest(bus)).eigenvalues()
+    lin = linearise(*at_rest(ended("unit.INF", **machine)))
+    assert not any(name.startswith("unit.INF.machine.omega") for name in lin.x_names)
+    values = lin.eigenvalues()
+    values = values[np.argsort(np.abs(values))]
+    if reference == "INF":
+        assert len(values) == len(expected)
+    for value in expected:
+        assert np.abs(values - value).min() < 1e-7
 
 
 def test_nothing_to_move():
