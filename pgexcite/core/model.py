@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
+from zipfile import BadZipFile
 
 import casadi as ca
 import numpy as np
@@ -131,9 +132,9 @@ class State:
             SnapshotError: the file cannot be read or belongs to another model.
         """
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 content = {key: data[key] for key in data.files}
-        except (OSError, ValueError) as cause:
+        except (OSError, ValueError, EOFError, BadZipFile) as cause:
             raise SnapshotError(f"{path}: not a snapshot that can be read ({cause})") from cause
         missing = {"fingerprint", "k", "t", "startup", "x", "z", "d", "u", "p"} - content.keys()
         if missing:

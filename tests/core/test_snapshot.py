@@ -95,3 +95,13 @@ def test_a_file_that_is_no_snapshot_is_refused(tmp_path):
     (tmp_path / "snapshot.npz").write_text("not this")
     with pytest.raises(SnapshotError, match="not a snapshot"):
         make("st1a", "never").resume(tmp_path / "snapshot.npz")
+
+
+@pytest.mark.parametrize("kept", [0, 30, 3000])
+def test_a_snapshot_cut_short_is_refused(tmp_path, kept):
+    sim = make("st1a", "never")
+    path = tmp_path / "snapshot.npz"
+    sim.save(path)
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(SnapshotError, match="not a snapshot"):
+        sim.resume(path)
