@@ -31,8 +31,8 @@ MOVED = 1e-6
 """A discrete state that moves an algebraic unknown by more than this, pu, makes a discontinuity."""
 COMPILED_BY_DEFAULT = 400
 """Entries of the factors up to which ``compile = "auto"`` waits for the compiler (about a second)."""
-MAX_SUBDIVISION = 256
-"""Shortest inner step a failing step is retried with, as a fraction of the step."""
+SUBDIVISIONS = (2, 8, 32, 128)
+"""Numbers of equal inner steps a failing step is retried in, one after the other."""
 
 RULES: tuple[Rule, ...] = ("tr_bdf2", "trapezoidal", "backward_euler")
 
@@ -301,13 +301,11 @@ class Kernel:
     def _subdivide(self, rule: Rule, h: float) -> bool:
         """The same step in shorter inner steps."""
         x, z = self.x.copy(), self.z.copy()
-        parts = 2
         inner: Rule = "backward_euler" if rule == "trapezoidal" else rule
-        while parts <= MAX_SUBDIVISION:
+        for parts in SUBDIVISIONS:
             if all(self.take(inner, h / parts, 0) for _ in range(parts)):
                 return True
             self.x[:], self.z[:] = x, z
-            parts *= 4
         return False
 
     def settle_here(self) -> bool:
