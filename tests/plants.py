@@ -49,7 +49,9 @@ def regulated(**slots: Component) -> System:
     return kobbelv(**(REGULATED | slots))
 
 
-def two_units(reference: str = "auto", *, grid: bool = True, load: Component | None = None) -> System:
+def two_units(
+    reference: str = "auto", *, grid: bool = True, load: Component | None = None, exciter: Component | None = None
+) -> System:
     """A round-rotor and a salient-pole unit that feed a load, and an infinite bus over two lines where ``grid``.
 
     Without the infinite bus the first unit is the slack of the power flow.
@@ -57,7 +59,8 @@ def two_units(reference: str = "auto", *, grid: bool = True, load: Component | N
     ends = {"L1": ("A", "L"), "L2": ("B", "L")} | ({"L3": ("L", "INF"), "L4": ("L", "INF")} if grid else {})
     demand = load or ConstantImpedance(P=150.0, Q=30.0)
     first: dict[str, Component] = {"machine": GENROU(), "exciter": SEXS(), "governor": ConstantTorque()}
-    second: dict[str, Component] = {"machine": SalientPole(), "exciter": ST1A(K_A=50.0), "governor": ConstantTorque()}
+    regulator = exciter or ST1A(K_A=50.0)
+    second: dict[str, Component] = {"machine": SalientPole(), "exciter": regulator, "governor": ConstantTorque()}
     devices = [
         Device("unit.G1", "A", 100.0, first, Schedule(P=70.0, V=1.02) if grid else Schedule(V=1.02, angle=0.0)),
         Device("unit.G2", "B", 175.0, second, Schedule(P=90.0, V=1.01)),
