@@ -18,6 +18,10 @@ from pgexcite.core.prediction import Transition
 Array = NDArray[np.float64]
 
 
+_LARGEST = 2.0
+"""Disturbance beyond which the filter has diverged, pu: the arc fault at the transformer of the scenarios makes one of 0.95."""
+
+
 @dataclass(frozen=True)
 class Noise:
     """What the filter assumes: standard deviations, of the measurements and of what comes in during a sample.
@@ -97,8 +101,9 @@ class OffsetFreeFilter:
 
     @property
     def sound(self) -> bool:
-        """Whether the estimate is finite."""
-        return bool(np.isfinite(self.at.x).all() and np.isfinite(self.at.P).all())
+        """Whether the estimate is finite, and no disturbance is larger than any that an undamaged plant could explain."""
+        finite = bool(np.isfinite(self.at.x).all() and np.isfinite(self.at.P).all())
+        return finite and bool(np.abs(self.at.x[self._n :]).max(initial=0.0) <= _LARGEST)
 
     def disturbed(self, y: Array) -> Array:
         """Outputs of the model with the disturbances on them, shape ``(..., n_y)``."""
