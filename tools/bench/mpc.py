@@ -66,10 +66,15 @@ class Times:
         return found
 
     def row(self, reference: np.ndarray) -> dict[str, Any]:
-        """Medians and tails, us, and how far the commands are from the converged ones, pu."""
+        """Medians and tails, us, and how far the commands are from the converged ones, pu.
+
+        The first sample of a pass starts from nothing; a controller makes it before it is in charge. It is left out.
+        """
+        warm = np.arange(len(self.cpu)) % reference.size > 0
         off = np.abs(np.resize(reference, len(self.commands)) - self.commands)
-        row: dict[str, Any] = {"samples": len(self.cpu)}
-        for name, times in (("cpu", self.cpu), ("wall", self.wall)):
+        row: dict[str, Any] = {"samples": int(warm.sum())}
+        for name, found in (("cpu", self.cpu), ("wall", self.wall)):
+            times = np.array(found)[warm]
             for label, q in (("median", 50), ("p99", 99), ("p99.9", 99.9)):
                 row[f"{name} {label}"] = round(1e6 * float(np.percentile(times, q)), 1)
         if self.commands:
