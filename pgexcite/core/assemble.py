@@ -16,6 +16,11 @@ from pgexcite.core.model import Model, require
 from pgexcite.core.network import NetworkElement, complex_product
 from pgexcite.core.system import Device, System
 
+_TURN = 0.37
+"""Real part of what the currents of a bus are multiplied with; any number that is not a ratio of admittances does."""
+_LEAK = 1e-12
+"""Conductance to earth at every bus, pu: far below the residual that is accepted."""
+
 
 @dataclass
 class _Table:
@@ -404,12 +409,14 @@ def _network(
     rows: list[Expr] = []
     for name in system.buses:
         # Exact for a bolted fault too: with status 1 the rows read (R + jX) * sum(i) = v, and v = 0 where R = X = 0. Without a
-        # fault the imaginary current comes first: through the susceptances it then depends on v_re, so that the same pairing of
-        # rows and unknowns has nonzero pivots with and without the fault.
-        p, v, i = symbols.element(f"bus.{name}"), symbols.voltage[name], total[name]
+        # fault the current is turned by (w + j): each row then depends on its own voltage through conductance and susceptance
+        # alike, so that one pairing of rows and unknowns has nonzero pivots with a fault and without, at a bus of a lossless
+        # network and at one that is left alone with a resistor. The leak puts a bus that is cut off from everything to zero.
+        p, v = symbols.element(f"bus.{name}"), symbols.voltage[name]
+        i = [total[name][k] - _LEAK * v[k] for k in (0, 1)]
         on, R, X = p["fault_status"], p["fault_R"], p["fault_X"]
-        rows.append((1 - on) * i[1] + on * (R * i[0] - X * i[1] - v[0]))
-        rows.append((1 - on) * i[0] + on * (R * i[1] + X * i[0] - v[1]))
+        rows.append((1 - on) * (_TURN * i[0] - i[1]) + on * (R * i[0] - X * i[1] - v[0]))
+        rows.append((1 - on) * (i[0] + _TURN * i[1]) + on * (R * i[1] + X * i[0] - v[1]))
     return flows, rows
 
 

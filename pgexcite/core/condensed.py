@@ -162,3 +162,12 @@ class Condensed:
     def clipped(self, plan: Array) -> Array:
         """A plan within the bounds on commands."""
         return np.clip(plan, self.problem.u_min, self.problem.u_max)
+
+    def reachable(self, plan: Array, u_last: Array) -> Array:
+        """The nearest plan that keeps the bounds on moves from ``u_last`` on, and those on commands."""
+        kept = np.empty_like(plan)
+        before = u_last
+        for k, move in enumerate(plan):
+            before = self.clipped(np.clip(move, before - self.problem.du_max, before + self.problem.du_max))
+            kept[k] = before
+        return kept

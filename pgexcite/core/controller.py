@@ -64,7 +64,9 @@ class Sample:
     Attributes:
         t: s.
         active: whether the controller is in charge; a controller on standby keeps track and its commands are not used.
-        measured: signal path -> value, of the signals the controller asked for; NaN where the sample was lost.
+        measured: signal path -> value, of the signals the controller asked for; NaN where the sample was lost. Set-points asked for
+            are read back.
+        ordered: whether an event has said who is in charge since the last sample.
         state, p: the plant's state and parameters, for perfect information only, else ``None``.
     """
 
@@ -73,6 +75,7 @@ class Sample:
     active: bool = True
     state: State | None = None
     p: Array | None = None
+    ordered: bool = False
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class Controller(Protocol):
         ...
 
     def measures(self) -> Sequence[str]:
-        """Paths of the outputs it measures."""
+        """Paths of the outputs it measures and of the set-points it reads back."""
         ...
 
     def start(self, surroundings: Surroundings, plant: Plant | None) -> Session:

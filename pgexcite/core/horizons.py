@@ -80,6 +80,13 @@ class Horizons:
                 u, p = self._changed(u, p, change)
         return u, p
 
+    def between(self, t: float, until: float, u: Array, p: Array) -> tuple[Array, Array]:
+        """Commands and parameters in force at ``until`` where ``u`` and ``p`` were at ``t``, as far as changes are known."""
+        for change in self.problem.known:
+            if t + _SAME_INSTANT < self._instant(change) <= until + _SAME_INSTANT:
+                u, p = self._changed(u, p, change)
+        return u, p
+
     def _instant(self, change: Change) -> float:
         return float(np.ceil(change.t / self.grid - 1e-6) * self.grid)
 

@@ -28,6 +28,9 @@ from pgexcite.core.mpc import Problem, Solution, Solver, Status
 
 Array = NDArray[np.float64]
 
+_MOVE_SLACK = 1e-6
+"""By how much a move may exceed its bound: the tolerance of the quadratic program."""
+
 _PLAUSIBLE = 1e3
 """Largest measured value that is believed, pu."""
 _MOVED = 1e-6
@@ -43,7 +46,7 @@ class Actuator:
         feedback: paths of the measured signals that say what is really in force; empty where the commands always are.
         engaged: set-points that put the controller in charge; their opposites (0 for 1) hand back. Empty where there is nobody to
             hand back to.
-        returns: whether the set-points go back to their initial values after control is handed back.
+        returns: whether the set-points go back, after control is handed back, to where they were when it was taken.
     """
 
     setpoints: tuple[str, ...]
@@ -76,7 +79,7 @@ class Ladder:
         self, problem: Problem, solver: Solver, actuator: Actuator, options: LadderOptions, u_0: Array
     ) -> None:
         self.problem, self.solver, self.actuator, self.options = problem, solver, actuator, options
-        self.u_0 = u_0
+        self.u_0 = self._home = u_0
         self._u, self._move = u_0, np.zeros_like(u_0)
         self._next = u_0
         self._plan = np.tile(u_0, (problem.N_c, 1))
@@ -86,6 +89,7 @@ class Ladder:
         self._good = 0
         self._in_charge = False
         self._stepped_down = False
+        self._returning = False
 
     # The protocol of a session.
 
@@ -96,12 +100,18 @@ class Ladder:
         passed = self._passed(sample)
         self._take_bearings(sample)
         began = time.perf_counter()
-        solution = self.solver.solve(sample, self._next if self.problem.delayed else self._u)
+        in_force = self._next if self.problem.delayed else self._u
+        solution = self._solve(sample, in_force)
         elapsed = 1e3 * (time.perf_counter() - began)
-        why = self._objection(sample, solution, elapsed)
+        why = self._objection(sample, solution, in_force, elapsed)
         self._good = 0 if why else self._good + 1
         if not why:
             self._plan, self._reused = solution.u, 0
+        elif not self._in_charge:
+            # A plan from standby was never in force: until there is a good one, what is in force is the plan.
+            self._plan = np.tile(in_force, (self.problem.N_c, 1))
+        if sample.ordered:
+            self._stepped_down = False
         diagnostics = {
             "level": float(self._level(why, active=sample.active)),
             "predicted_cost": solution.cost,
@@ -114,22 +124,44 @@ class Ladder:
         action = self._active(why, notes) if sample.active else self._standby(why, notes)
         return Action(action.commands, diagnostics, passed, bool(why) and sample.active, action.release, tuple(notes))
 
+    def _solve(self, sample: Sample, in_force: Array) -> Solution:
+        """A solution, whatever happens: arithmetic that fails inside a solver is a failed plan, not the end of the run."""
+        try:
+            return self.solver.solve(sample, in_force)
+        except (ArithmeticError, np.linalg.LinAlgError, RuntimeError) as error:
+            plan = np.tile(in_force, (self.problem.N_c, 1))
+            return Solution(Status.SOLVER_FAILED, plan, np.inf, 0, np.inf, message=f"{type(error).__name__}: {error}")
+
     def prepare(self) -> None:
         """Let the solver prepare the next sample."""
         self.solver.prepare(self._next if self.problem.delayed else self._u)
 
     def memory(self) -> Mapping[str, Array]:
         """All that is kept between samples."""
-        names = ("u", "move", "next", "plan", "reused", "stale", "seen", "good", "in_charge", "stepped_down")
+        names = (
+            "u",
+            "move",
+            "next",
+            "plan",
+            "reused",
+            "stale",
+            "seen",
+            "good",
+            "in_charge",
+            "stepped_down",
+            "returning",
+            "home",
+        )
         own = as_arrays({name: getattr(self, f"_{name}") for name in names})
         return own | {f"solver:{key}": value for key, value in self.solver.memory().items()}
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
-        names = ("u", "move", "next", "plan", "seen")
-        self._u, self._move, self._next, self._plan, self._seen = (memory[name] for name in names)
+        names = ("u", "move", "next", "plan", "seen", "home")
+        self._u, self._move, self._next, self._plan, self._seen, self._home = (memory[name] for name in names)
         self._reused, self._stale, self._good = (int(memory[name]) for name in ("reused", "stale", "good"))
-        self._in_charge, self._stepped_down = bool(memory["in_charge"] > 0), bool(memory["stepped_down"] > 0)
+        flags = ("in_charge", "stepped_down", "returning")
+        self._in_charge, self._stepped_down, self._returning = (bool(memory[name] > 0) for name in flags)
         start = "solver:"
         self.solver.recall({key.removeprefix(start): value for key, value in memory.items() if key.startswith(start)})
 
@@ -159,13 +191,13 @@ class Ladder:
 
     # After it.
 
-    def _objection(self, sample: Sample, solution: Solution, elapsed_ms: float) -> str:
+    def _objection(self, sample: Sample, solution: Solution, in_force: Array, elapsed_ms: float) -> str:
         """Why this plan may not be used; ``""`` where it may."""
         options = self.options
         if not options.perfect and self._stale > options.max_age:
             return f"the measurement is {self._stale} samples old"
         if not solution.status.usable:
-            return solution.status.value
+            return f"{solution.status.value} {solution.message}".strip()
         if not np.isfinite(solution.u).all():
             return "the plan is not finite"
         if not np.isfinite(solution.cost):
@@ -173,6 +205,8 @@ class Ladder:
         slack = 1e-9
         if (solution.u < self.problem.u_min - slack).any() or (solution.u > self.problem.u_max + slack).any():
             return "the plan leaves its bounds"
+        if (np.abs(solution.u[0] - in_force) > self.problem.du_max + _MOVE_SLACK).any():
+            return "the plan's first move is larger than a move may be"
         if options.deadline_ms and elapsed_ms > options.deadline_ms:
             return f"the plan came after {elapsed_ms:.3g} ms, later than its deadline of {options.deadline_ms:g} ms"
         return ""
@@ -187,7 +221,8 @@ class Ladder:
     def _active(self, why: str, notes: list[str]) -> Action:
         """In charge: this plan, or the old one, or down to the classical controller."""
         if not self._in_charge:
-            self._in_charge, self._stepped_down = True, False
+            self._in_charge, self._stepped_down, self._returning = True, False, False
+            self._home = self._u
             notes.append("takes charge")
         if why:
             if self._reused == 0:
@@ -220,7 +255,7 @@ class Ladder:
             self._move = np.zeros_like(self._u)
             return Action(self._addressed(self._u))
         notes.append(f"hands over to the classical controller: {why}")
-        self._in_charge, self._stepped_down = False, True
+        self._in_charge, self._stepped_down, self._returning = False, True, self.actuator.returns
         self._move = np.zeros_like(self._u)
         return Action(dict.fromkeys(self.actuator.engaged, 0.0), release=True)
 
@@ -229,22 +264,23 @@ class Ladder:
         commands: dict[str, float] = {}
         self._move = np.zeros_like(self._u)
         if self._in_charge:
-            self._in_charge = False
+            self._in_charge, self._returning = False, self.actuator.returns
             notes.append("hands over to the classical controller, as told")
             commands = dict.fromkeys(self.actuator.engaged, 0.0)
         if self._stepped_down and not why and self._good >= self.options.recover_after:
             notes.append(f"plans have been good for {self._good} samples: control is taken back")
             self._reused = 0
             return Action(commands, release=False)
-        if self.actuator.returns:
+        if self._returning:
             self._u = self._next = self._returned()
+            self._returning = not np.array_equal(self._u, self._home)
             commands |= self._addressed(self._u)
         return Action(commands)
 
     def _returned(self) -> Array:
         """The set-point on its way back to where it was before this controller moved it."""
         reach = self.options.return_rate * self.problem.dt
-        return self._u + np.clip(self.u_0 - self._u, -reach, reach)
+        return self._u + np.clip(self._home - self._u, -reach, reach)
 
 
 def _believed(sample: Sample) -> Sample:

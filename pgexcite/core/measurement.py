@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
@@ -29,24 +31,27 @@ class Measurement(BaseModel):
 class Instruments:
     """The measurements of one controller in one run.
 
-    The random numbers of sample ``k`` depend on the seed and ``k`` alone (a counter-based generator), so a resumed run draws the
-    same; only the delayed samples are remembered.
+    The random numbers of sample ``k`` depend on the seed, the signals and ``k`` alone (a counter-based generator), so a resumed
+    run draws the same; only the delayed samples are remembered.
 
     Args:
         settings: the imperfections.
-        paths: the signals.
+        paths: the signals; set-points among them are read back exactly.
+        setpoints: which of them are set-points, shape ``(n,)``.
     """
 
-    def __init__(self, settings: Measurement, paths: tuple[str, ...]) -> None:
+    def __init__(self, settings: Measurement, paths: tuple[str, ...], setpoints: NDArray[np.bool_]) -> None:
         self._settings, self._paths = settings, paths
         speed = np.array([path.endswith(".omega") for path in paths], dtype=bool)
-        self._deviation = np.where(speed, settings.noise_omega, settings.noise)
+        self._deviation = np.where(setpoints, 0.0, np.where(speed, settings.noise_omega, settings.noise))
+        # Controllers of one seed that measure different signals draw different numbers.
+        self._key = np.array([settings.seed, zlib.crc32("\0".join(paths).encode())], dtype=np.uint64)
         self._past = np.empty((0, len(paths)))
 
     def read(self, k: int, values: Array) -> dict[str, float]:
         """What the controller is told at its sample ``k``, by path; ``values`` are the true signals in order of the paths."""
         settings = self._settings
-        generator = np.random.Generator(np.random.Philox(key=settings.seed, counter=[0, 0, 0, k]))
+        generator = np.random.Generator(np.random.Philox(key=self._key, counter=[0, 0, 0, k]))
         seen = values + self._deviation * generator.standard_normal(values.size)
         if generator.random() < settings.loss:
             seen = np.full_like(seen, np.nan)

@@ -28,6 +28,7 @@ class Status(Enum):
     ITERATED = "the allowed iterations were used; the plan is feasible and better than the one it started from"
     PREDICTION_FAILED = "the model could not be stepped over the horizon; shorten the horizon or the prediction step"
     STATE_UNKNOWN = "the state is not known: no usable measurement, or the estimator has diverged"
+    SOLVER_FAILED = "the solver's arithmetic failed;"
     QP_FAILED = "the quadratic program was not solved; check weights and bounds for infinities and contradictions"
 
     @property
@@ -155,6 +156,7 @@ class Solution:
         step: largest change of a command in the last iteration; how far from converged it may still be.
         times_ms: phase -> wall time, ms.
         diagnostics: further numbers worth recording (an estimator's states and covariances), by name.
+        message: what else there is to say of a plan that failed.
     """
 
     status: Status
@@ -164,6 +166,7 @@ class Solution:
     step: float
     times_ms: Mapping[str, float] = field(default_factory=dict)
     diagnostics: Mapping[str, float] = field(default_factory=dict)
+    message: str = ""
 
 
 class Solver(Protocol):

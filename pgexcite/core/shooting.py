@@ -59,6 +59,8 @@ class _Prepared:
 
     plan: Array
     x: Array
+    d: Array
+    u: Array
     p: Array
     y: Array
     G: Array
@@ -102,7 +104,9 @@ class Shooting(ABC):
         self.horizons = Horizons(model, problem, h, grid)
         self._plan: Array | None = None
         self._prepared: _Prepared | None = None
-        self._from: tuple[State, float] | None = None
+        self._from: tuple[State, float, Array] | None = None
+        owned = {*problem.commands, *problem.fixed}
+        self._others = np.array([path not in owned for path in model.u_names], dtype=bool)
         self.p: Array = np.empty(0)
 
     @abstractmethod
@@ -125,16 +129,17 @@ class Shooting(ABC):
         self._prepared = None
         if self.options.mode != "rti" or self._from is None or self._plan is None:
             return
-        state, t = self._from
-        expected = self._advance(state, t, u)
-        if expected is None:
+        state, t, p = self._from
+        later = self._advance(state, t, u, p)
+        if later is None:
             return
-        plan = self.condensed.clipped(self.problem.shifted(self._plan))
-        horizon = self.horizons.at(t + self.problem.dt, expected.u, self.p)
+        expected, p = later
+        plan = self.condensed.reachable(self.problem.shifted(self._plan), u)
+        horizon = self.horizons.at(t + self.problem.dt, expected.u, p)
         rollout = self.predictor.roll(expected, plan, horizon, derivatives=True)
         if rollout is not None and rollout.dy is not None:
             G_x = np.zeros((*rollout.y.shape, 0)) if rollout.dx is None else rollout.dx
-            self._prepared = _Prepared(plan, expected.x, self.p, rollout.y, rollout.dy, G_x)
+            self._prepared = _Prepared(plan, expected.x, expected.d, expected.u, p, rollout.y, rollout.dy, G_x)
 
     def memory(self) -> Mapping[str, Array]:
         """Plan, linearisation and the QP's warm start."""
@@ -163,26 +168,28 @@ class Shooting(ABC):
         if state is None or not _finite(state, self.p):
             self._from = None
             return Solution(Status.STATE_UNKNOWN, hold, np.inf, 0, np.inf)
+        p = self.p
         if self.problem.delayed:
-            later = self._advance(state, t, u_last)
+            later = self._advance(state, t, u_last, p)
             if later is None:
                 return Solution(Status.PREDICTION_FAILED, hold, np.inf, 0, np.inf)
-            state, t = later, t + self.problem.dt
-        self._from = (state, t)
-        expected = self._expected(state)
+            state, p = later
+            t += self.problem.dt
+        self._from = (state, t, p)
+        expected = self._expected(state, p)
         if expected is not None:
             solution = self._feedback(expected, state, t, u_last)
         else:
             converge = self.options.mode == "converged" or self._plan is None
             count = self.options.max_iterations if converge else self.options.jump_iterations
-            solution = self._iterate(state, t, u_last, hold, count)
+            solution = self._iterate(state, t, p, u_last, count)
         if solution.status.usable:
             self._plan = solution.u
         return solution
 
-    def _advance(self, state: State, t: float, u: Array) -> State | None:
-        """The state one sample later under these commands, with what is known to happen; ``None`` if it cannot be had."""
-        horizon = self.horizons.at(t, state.u, self.p)
+    def _advance(self, state: State, t: float, u: Array, p: Array) -> tuple[State, Array] | None:
+        """State and parameters one sample later under these commands, with all that is known to happen by then."""
+        horizon = self.horizons.at(t, state.u, p)
         last = int(np.flatnonzero(horizon.ends)[0]) + 1
         row = -1
         for count, h, k in zip(horizon.counts[:last], horizon.lengths[:last], horizon.rows[:last], strict=True):
@@ -199,12 +206,19 @@ class Shooting(ABC):
             if segment.failed:
                 return None
             state = segment.state
-        return state
+        wanted, after = self.horizons.between(t, t + self.problem.dt, horizon.u[0], p)
+        wanted[self._commands] = u
+        if np.array_equal(after, horizon.p[row]) and np.array_equal(wanted, state.u):
+            return state, after
+        settled = self.kernel.settle(state.with_(u=wanted), after)
+        return None if settled is None else (settled, after)
 
-    def _expected(self, state: State) -> _Prepared | None:
-        """The linearisation prepared for this sample, unless the state or the network is not what was expected."""
+    def _expected(self, state: State, p: Array) -> _Prepared | None:
+        """The linearisation prepared for this sample, unless state, network or the commands of others are not as expected."""
         ready = self._prepared
-        if ready is None or not np.array_equal(ready.p, self.p):
+        if ready is None or not np.array_equal(ready.p, p):
+            return None
+        if not np.array_equal(state.u[self._others], ready.u[self._others]) or not np.array_equal(state.d, ready.d):
             return None
         reach = self.options.jump if ready.G_x.shape[2] else _SAME_STATE
         return ready if np.abs(state.x - ready.x).max(initial=0.0) <= reach else None
@@ -242,11 +256,16 @@ class Shooting(ABC):
             if np.isfinite(bound).all()
         ]
 
-    def _iterate(self, state: State, t: float, u_last: Array, hold: Array, count: int) -> Solution:
+    def _iterate(self, state: State, t: float, p: Array, u_last: Array, count: int) -> Solution:
         """Gauss-Newton with a line search on the true cost."""
         references = self.problem.references(t)
-        horizon = self.horizons.at(t, state.u, self.p)
-        starts = [hold] if self._plan is None else [self.condensed.clipped(self.problem.shifted(self._plan)), hold]
+        horizon = self.horizons.at(t, state.u, p)
+        # A plan made on standby was never in force: it may begin further from the command in force than a move may go.
+        wanted = [np.tile(u_last, (self.problem.N_c, 1))]
+        if self._plan is not None:
+            wanted.insert(0, self.problem.shifted(self._plan))
+        starts = [self.condensed.reachable(plan, u_last) for plan in wanted]
+        hold = starts[-1]
         plan, rollout = self._first(starts, state, horizon)
         if rollout is None:
             plan, rollout = self._first(self._towards_bounds(u_last), state, horizon)
@@ -266,22 +285,36 @@ class Shooting(ABC):
             if step <= self.options.tolerance:
                 status = Status.CONVERGED
                 break
-            better = None
-            scale = 1.0
-            while better is None and scale >= SHORTEST:
-                trial = self.condensed.clipped(plan + scale * direction)
-                rolled = self.predictor.roll(state, trial, horizon, derivatives=True)
-                if rolled is not None:
-                    trial_cost = self.condensed.cost(rolled.y, references, trial, u_last)
-                    if trial_cost <= cost + DECREASE * scale * min(slope, 0.0):
-                        better = trial, rolled, trial_cost
-                scale /= 2
+            better = self._search(state, horizon, plan, direction, u_last, references, (cost, slope))
             if better is None:
                 # No decrease can be had along a descent direction: converged to the rounding of the cost.
                 status = Status.CONVERGED if step <= np.sqrt(self.options.tolerance) else status
                 break
             plan, rollout, cost = better
         return Solution(status, plan, cost, iteration, step)
+
+    def _search(
+        self,
+        state: State,
+        horizon: Horizon,
+        plan: Array,
+        direction: Array,
+        u_last: Array,
+        references: Array,
+        descent: tuple[float, float],
+    ) -> tuple[Array, Rollout, float] | None:
+        """Backtracking on the true cost; ``descent`` is its value and slope. ``None`` where no decrease is found."""
+        cost, slope = descent
+        scale = 1.0
+        while scale >= SHORTEST:
+            trial = self.condensed.clipped(plan + scale * direction)
+            rolled = self.predictor.roll(state, trial, horizon, derivatives=True)
+            if rolled is not None:
+                trial_cost = self.condensed.cost(rolled.y, references, trial, u_last)
+                if trial_cost <= cost + DECREASE * scale * min(slope, 0.0):
+                    return trial, rolled, trial_cost
+            scale /= 2
+        return None
 
 
 def _finite(state: State, p: Array) -> bool:

@@ -126,9 +126,12 @@ class MPC(BaseModel):
         return self.voltages or tuple(f"{unit}.v_t" for unit in self.units)
 
     def measures(self) -> Sequence[str]:
-        """The units' own terminals (voltage, speed, powers, field voltage and current), and what is tracked or bounded."""
+        """The units' own terminals, what is tracked or bounded, and the set-points it moves."""
         signals = ("v_t", "omega", "p_e", "q_e", "e_fd", "i_fd", *(bound.signal for bound in self.soft))
-        return list(dict.fromkeys([*(f"{unit}.{name}" for unit in self.units for name in signals), *self.tracked]))
+        moved = [f"{unit}.exciter.v_ref" for unit in self.units] if self.command == "v_ref" else []
+        return list(
+            dict.fromkeys([*(f"{unit}.{name}" for unit in self.units for name in signals), *self.tracked, *moved])
+        )
 
     def actuator(self, setpoints: Mapping[str, float]) -> Actuator:
         """Where its commands go.
@@ -154,7 +157,7 @@ class MPC(BaseModel):
                     for path in missing
                 ]
             )
-        return Actuator(paths, returns=self.command == "v_ref")
+        return Actuator(paths, paths, returns=True) if self.command == "v_ref" else Actuator(paths)
 
     def start(self, surroundings: Surroundings, plant: Plant | None) -> Session:
         """Begin a run.

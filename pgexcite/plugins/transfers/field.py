@@ -18,8 +18,8 @@ class FieldTransfer(Transfer):
                  bias b --------(+)                 +--> [clip floor .. ceiling] --> e_fd
         e_fd_cmd --------------------> manual = 1 --+
 
-        manual = 1:  b = e_fd_cmd - e_fd of the exciter         (the standby tracks)
-        manual = 0:  T_B b' = -b                                (the difference fades)
+        manual = 1:  b = e_fd_cmd, limited, - e_fd of the exciter     (the standby tracks)
+        manual = 0:  T_B b' = -b                                      (the difference fades)
 
     With ``ceiling = "rectifier"`` the limits are those of a static exciter fed from the terminals, ``v_t V_RMIN`` and
     ``v_t V_RMAX - K_C i_fd``; with ``"fixed"`` they are ``V_RMIN`` and ``V_RMAX``. A controller that takes over starts from the
@@ -44,9 +44,10 @@ class FieldTransfer(Transfer):
 
     def equations(self, v: Signals) -> Equations:
         auto = 1 - v.manual
-        track = der(v.b, v.manual * (v.e_fd_cmd - v.e_fd) - v.b, T=auto * self.T_B)
-        wanted = v.manual * v.e_fd_cmd + auto * (v.e_fd + v.b)
         low, high = self._limits(v)
+        commanded = clip(v.e_fd_cmd, low, high, "commanded field voltage")
+        track = der(v.b, v.manual * (commanded - v.e_fd) - v.b, T=auto * self.T_B)
+        wanted = v.manual * commanded + auto * (v.e_fd + v.b)
         return Equations(
             ode=(track,),
             out={"e_fd": clip(wanted, low, high, "field voltage"), "e_fd_exciter": v.e_fd},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plants import regulated
 
-from pgexcite.core.events import Fault, HandOver
+from pgexcite.core.events import Change, Fault, HandOver
 from pgexcite.core.mpc import Solution, Status
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
@@ -144,3 +144,63 @@ def test_the_ceiling_follows_the_terminal_voltage():
     assert (trace["unit.G2.e_fd"] <= ceiling + 1e-9).all()
     assert np.any(np.abs(trace["unit.G2.e_fd"] - ceiling) < 1e-9)
     assert trace["unit.G2.transfer.e_fd_cmd"].max() > ceiling.min()
+
+
+@pytest.mark.parametrize("t", [0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9])
+def test_the_first_move_after_taking_over_keeps_its_bound(t):
+    """Several moves, and a plan from standby that was never in force: it must not be where the first move comes from."""
+    fault = Fault(type="fault", t=0.3, bus="HV", R=0.02, duration=0.1).changes()
+    reach = {"u_min": -3.85, "u_max": 3.85, "du_max": 0.05, "N_c": 5, "R": 1e-4}
+    sim = run([*fault, over(t, "controller")], t_end=t + 0.03, **reach)
+    trace = sim.trace()
+    at = np.flatnonzero(np.abs(trace.t - t) < 1e-9)
+    assert abs(trace["unit.G2.e_fd"][at[-1]] - trace["unit.G2.e_fd"][at[0]]) <= 0.05 + 1e-6
+
+
+def test_an_order_to_hand_over_is_final():
+    """After a step down of its own the controller would come back; told to hand over meanwhile, it stays away."""
+    sim = run(
+        [over(1.2, "classical")],
+        active=True,
+        sabotage=lambda good: _FailsBetween(good, 10, 20),
+        max_reuse=2,
+        recover_after=5,
+    )
+    assert sim.get("unit.G2.transfer.manual") == 0.0
+    assert not any("control is taken back" in entry.text for entry in sim.trace().log)
+
+
+def test_on_standby_the_set_point_belongs_to_others():
+    step = Change(1.0, {}, "v_ref steps", {"unit.G2.exciter.v_ref": 0.02})
+    sim = run([step], active=False, command="v_ref", u_min=0.9, u_max=1.1)
+    trace = sim.trace()
+    v_ref = trace["unit.G2.exciter.v_ref"]
+    assert v_ref[-1] == pytest.approx(v_ref[0] + 0.02, abs=1e-12)
+
+
+def test_a_solver_whose_arithmetic_fails_is_a_failed_plan():
+    class Singular:
+        def solve(self, sample, u_last):
+            raise np.linalg.LinAlgError("singular")
+
+        def prepare(self, u):
+            pass
+
+        def memory(self):
+            return {}
+
+    sim = run(active=True, sabotage=lambda _: Singular(), max_reuse=2, t_end=1.0)
+    log = " ".join(entry.text for entry in sim.trace().log)
+    assert "LinAlgError: singular" in log
+    assert np.ptp(sim.trace()["unit.G2.e_fd"]) < 1e-6
+
+
+def test_the_standby_bias_does_not_wind_up_against_the_ceiling():
+    """A command beyond the ceiling leaves a bias to what was in force, not to what was asked for."""
+    fault = Fault(type="fault", t=0.3, bus="HV", R=0.02, duration=0.1).changes()
+    transfer = FieldTransfer(V_RMIN=-2.0, V_RMAX=2.0)
+    trace = run([*fault, over(0.45, "classical")], active=True, transfer=transfer, t_end=0.6).trace()
+    at = np.flatnonzero(np.abs(trace.t - 0.45) < 1e-9)[-1]
+    assert trace["unit.G2.transfer.e_fd_cmd"][at - 2] > 2.05  # measured 2.084
+    in_force = trace["unit.G2.transfer.b"][at] + trace["unit.G2.e_fd_exciter"][at]
+    assert in_force == pytest.approx(2.0, abs=1e-9)

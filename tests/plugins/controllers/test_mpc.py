@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from plants import kobbelv, regulated
 from pydantic import ValidationError
 
 from pgexcite.core.errors import ConfigError
-from pgexcite.core.events import Fault
+from pgexcite.core.events import Change, Fault
 from pgexcite.core.mpc import Solution, Status
+from pgexcite.core.network import Bus, Line
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
+from pgexcite.core.system import Device, Schedule
 from pgexcite.plugins.controllers.mpc import MPC
+from pgexcite.plugins.loads.zip import ConstantImpedance
 
 FAULT = Fault(type="fault", t=0.2, bus="HV", R=0.02, duration=0.1)
 COMMAND = "unit.G2.exciter.e_fd_ref"
@@ -193,3 +198,49 @@ def test_real_time_iteration_costs_little_against_converged_plans():
     costs = [sim.result().controllers["mpc"].cost for sim in (quick, full)]
     assert costs[0] == pytest.approx(costs[1], rel=1e-3)  # measured 1.2e-7
     assert quick.trace()["controller.mpc.iterations"].sum() < full.trace()["controller.mpc.iterations"].sum()
+
+
+def test_known_disturbance_and_computing_delay_together():
+    """A fault that begins while a plan is being computed is in that plan."""
+    changes = Fault(type="fault", t=0.52, bus="HV", R=0.02, duration=0.3).changes()
+    traces = {}
+    for known in (True, False):
+        sim = Simulation(
+            kobbelv(),
+            Settings(0.7, 0.005, "tr_bdf2", "never"),
+            changes,
+            {"mpc": MPC(unit="G2", delayed=True, disturbance_known=known)},
+        )
+        sim.run()
+        traces[known] = sim.trace()
+    inside = traces[True].t > 0.56
+    assert traces[True][COMMAND][inside].min() > 3.0  # measured 3.2: full field all through the fault
+    assert traces[False][COMMAND][-1] > 3.0
+
+
+def test_a_set_point_of_others_is_seen_at_once():
+    """A step of the infinite bus moves neither a state nor a parameter at that instant; the plan must not be the one prepared."""
+    step = Change(0.5, {}, "grid voltage drops", {"infinite_bus.grid.v": -0.1})
+    sim = Simulation(kobbelv(), Settings(0.52, 0.005, "tr_bdf2", "never"), [step], {"mpc": MPC(unit="G2")})
+    sim.run()
+    assert sim.get(COMMAND) > 3.0  # measured 3.2
+
+
+def test_a_feeder_that_is_dead_does_not_stop_the_predictions():
+    """A bus left alone with a resistor: nothing about it is singular, and the plans go on."""
+    plant = kobbelv()
+    spur = replace(
+        plant,
+        buses={**plant.buses, "SPUR": Bus()},
+        lines={**plant.lines, "L9": Line(**{"from": "HV", "to": "SPUR"}, X=0.1)},
+        devices=(
+            *plant.devices,
+            Device("load.L", "SPUR", 175.0, {"": ConstantImpedance(P=30.0, Q=0.0)}, Schedule(P=-30.0, Q=0.0)),
+        ),
+    )
+    trip = Change(0.2, {"line.L9.status": 0.0}, "spur trips")
+    sim = Simulation(spur, Settings(0.6, 0.005, "tr_bdf2", "never"), [trip], {"mpc": MPC(unit="G2", N_p=6)})
+    assert sim.run().ending.value == "completed"
+    assert sim.get("bus.SPUR.v") < 1e-9
+    assert sim.result().controllers["mpc"].fallbacks == 0
+    assert not [entry for entry in sim.trace().log if entry.kind == "solver"]
