@@ -64,6 +64,7 @@ class _Running:
     every: int
     columns: NDArray[np.int_]
     active: bool
+    ordered: bool = False
     t: list[float] = field(default_factory=list)
     diagnostics: list[Mapping[str, float]] = field(default_factory=list)
     solve_ms: list[float] = field(default_factory=list)
@@ -272,7 +273,8 @@ class Simulation:
         for values, add in ((change.values, False), (change.increments or {}, True)):
             for path, value in values.items():
                 if _switched(path):
-                    self._running[_switched(path)].active = value > 0
+                    running = self._running[_switched(path)]
+                    running.active, running.ordered = value > 0, True
                     continue
                 array, group = (u, "u") if path in self.model.index["u"] else (p, "p")
                 k = self.model.position(group, path)
@@ -306,7 +308,8 @@ class Simulation:
             raise ConfigError([Problem(f"controller.{name}.dt", text, controller.dt)])
         s = self.initial.state
         y = self.kernel.outputs(s, self.initial.p)
-        missing = [path for path in controller.measures() if path not in self.model.index["y"]]
+        index = self.model.index
+        missing = [path for path in controller.measures() if path not in index["y"] and path not in index["u"]]
         if missing:
             raise ConfigError(
                 [
@@ -331,9 +334,14 @@ class Simulation:
                 self.model, Kernel(self.model, s, self.initial.p, self.settings.compile), self.initial.p.copy()
             )
         names = tuple(controller.measures())
-        columns = np.array([self.model.position("y", path) for path in names], dtype=int)
+        # Outputs and commands in one row: a controller may read back the set-points it moves.
+        setpoints = np.array([path in index["u"] for path in names], dtype=bool)
+        n_y = len(self.model.y_names)
+        columns = np.array(
+            [n_y + index["u"][path] if path in index["u"] else index["y"][path] for path in names], dtype=int
+        )
         session = controller.start(surroundings, plant)
-        instruments = Instruments(controller.measurement, names)
+        instruments = Instruments(controller.measurement, names, setpoints)
         return _Running(controller, session, instruments, every, columns, controller.active)
 
     def _control(self) -> None:
@@ -355,8 +363,10 @@ class Simulation:
         """Let a controller act; its commands go into ``u``."""
         s = self.state
         perfect = running.controller.information == "perfect"
-        measured = running.instruments.read(s.k // running.every, y[running.columns])
-        sample = Sample(s.t, measured, running.active, s if perfect else None, self.p.copy() if perfect else None)
+        measured = running.instruments.read(s.k // running.every, np.concatenate((y, s.u))[running.columns])
+        state, p = (s, self.p.copy()) if perfect else (None, None)
+        sample = Sample(s.t, measured, running.active, state, p, ordered=running.ordered)
+        running.ordered = False
         began = time.perf_counter()
         action = running.session.act(sample)
         running.solve_ms.append(1e3 * (time.perf_counter() - began))
