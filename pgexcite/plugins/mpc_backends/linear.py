@@ -53,7 +53,8 @@ class Linear(BaseModel):
     ``sigma_omega`` as they are, and a ``drift`` well below ``sigma`` for a quiet field voltage.
 
     With ``relinearise = "once"`` the model is that of the initial point, with ``"scheduled"`` it is made anew at the estimated
-    state every ``every`` samples, with ``"every"`` in each.
+    state every ``every`` samples, with ``"every"`` in each. In the middle of a swing a linear model carries the motion of that
+    instant on over the horizon; one that is renewed once a second follows the operating point and not every swing.
 
     Not modelled: a limit inside the model (a ceiling, a non-windup limit) is as it stands at the point of linearisation; discrete
     states stay as at the initial point; measurements are taken for fresh, whatever their delay.
@@ -66,8 +67,8 @@ class Linear(BaseModel):
     model: Mapping[str, float] = Field(
         default_factory=dict, description="parameters of its own model that are not the nameplate's, by path"
     )
-    relinearise: Literal["once", "scheduled", "every"] = par("every", "-", "when the model is linearised")
-    every: int = par(10, "-", "samples between two linearisations that are scheduled", ge=1)
+    relinearise: Literal["once", "scheduled", "every"] = par("scheduled", "-", "when the model is linearised")
+    every: int = par(20, "-", "samples between two linearisations that are scheduled", ge=1)
     disturbances: tuple[Disturbed, ...] | None = Field(
         None, description="what constant disturbances are estimated for; chosen by the command where left out"
     )
