@@ -289,14 +289,14 @@ def test_currents_balance_at_every_bus():
     initial = initialise(two_units())
     model, state = initial.model, initial.state
     g = np.array(model.dae(state.x, state.z, state.d, state.u, initial.p, 0.0)[4]).ravel()
-    assert np.abs(g).max() < 1e-12
+    assert np.abs(g).max() < 1e-10
     flow = initial.flow
     y = np.array(model.dae(state.x, state.z, state.d, state.u, initial.p, 0.0)[6]).ravel()
     out = {name: y[model.position("y", name)] for name in model.y_names}
-    assert out["line.L1.p_from"] == pytest.approx(flow.s["unit.G1"].real, abs=1e-12)
-    assert out["line.L2.q_from"] == pytest.approx(flow.s["unit.G2"].imag, abs=1e-12)
+    assert out["line.L1.p_from"] == pytest.approx(flow.s["unit.G1"].real, abs=1e-10)
+    assert out["line.L2.q_from"] == pytest.approx(flow.s["unit.G2"].imag, abs=1e-10)
     losses = sum(out[f"line.L{k}.p_{end}"] for k in range(1, 5) for end in ("from", "to"))
-    assert losses == pytest.approx(sum(s.real for s in flow.s.values()), abs=1e-12)
+    assert losses == pytest.approx(sum(s.real for s in flow.s.values()), abs=1e-10)
     assert losses > 0
 
 

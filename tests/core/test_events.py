@@ -98,7 +98,7 @@ def test_a_transformer_trips():
     _, trace = run(kobbelv(), BranchTrip(type="transformer_trip", t=0.2, name="T1", reclose_after=0.05))
     before, after = sides(trace, 0.2)
     assert trace["unit.G2.p_e"][before] == pytest.approx(0.86)
-    assert abs(trace["unit.G2.p_e"][after]) < 1e-12
+    assert abs(trace["unit.G2.p_e"][after]) < 1e-10
 
 
 @pytest.mark.parametrize(

@@ -125,5 +125,5 @@ def test_example_13_1_largest_angle(clearing, h):
 def test_no_power_flows_during_the_fault():
     sim = Simulation(example("13_1").system, example("13_1").settings, example("13_1").changes)
     sim.run(until=0.15)
-    assert abs(sim.get("unit.G.p_e")) < 1e-12
+    assert abs(sim.get("unit.G.p_e")) < 1e-10
     assert sim.get("bus.HT.v") < 1e-9
