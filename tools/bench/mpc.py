@@ -65,6 +65,13 @@ class Times:
         self.cpu.append(time.thread_time() - cpu)
         return found
 
+    def together(self, before: Times, call: Callable[[], Any]) -> None:
+        """Call, and note what it took together with the last of ``before``."""
+        own = Times()
+        own.measure(call)
+        self.cpu.append(before.cpu[-1] + own.cpu[0])
+        self.wall.append(before.wall[-1] + own.wall[0])
+
     def row(self, reference: np.ndarray) -> dict[str, Any]:
         """Medians and tails, us, and how far the commands are from the converged ones, pu.
 
@@ -80,6 +87,15 @@ class Times:
         if self.commands:
             row |= {"off median": float(f"{np.median(off):.1e}"), "off max": float(f"{off.max():.1e}")}
         return row
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """A solver, or a few measures of one, and how to take it through the sequence once."""
+
+    times: dict[str, Times]
+    once: Callable[[], None]
+    passes: int
 
 
 def scenario(N: int, t_end: float, **changes: Any) -> Any:
@@ -120,25 +136,24 @@ def sequence(N: int, t_end: float) -> tuple[list[tuple[Sample, np.ndarray]], np.
     return recorder.asked, np.array(recorder.answers)
 
 
-def real_time_iteration(N: int, t_end: float, asked: Sequence[Any], passes: int) -> dict[str, Times]:
+def real_time_iteration(N: int, t_end: float, asked: Sequence[Any], passes: int) -> Contestant:
     """Feedback alone, and feedback with preparation."""
     _, session = prepared(N, t_end)
     solver = session.solver
     feedback, whole = Times(), Times()
-    for _ in range(passes):
+
+    def once() -> None:
         solver.recall({"multipliers": np.zeros_like(solver.condensed.solver.memory())})
         for sample, u_last in asked:
             solution = feedback.measure(lambda s=sample, u=u_last: solver.solve(s, u))
-            preparation = Times()
-            preparation.measure(lambda s=solution: solver.prepare(s.u[0]))
-            whole.cpu.append(feedback.cpu[-1] + preparation.cpu[0])
-            whole.wall.append(feedback.wall[-1] + preparation.wall[0])
+            whole.together(feedback, lambda s=solution: solver.prepare(s.u[0]))
             for times in (feedback, whole):
                 times.commands.append(float(solution.u[0, 0]))
-    return {"pgexcite, feedback": feedback, "pgexcite, preparation and feedback": whole}
+
+    return Contestant({"pgexcite, feedback": feedback, "pgexcite, preparation and feedback": whole}, once, passes)
 
 
-def exported(N: int, t_end: float, folder: Path, passes: int) -> dict[str, Times]:
+def exported(N: int, t_end: float, folder: Path, passes: int) -> Contestant:
     """The exported C on its own replay."""
     directory = export_c(scenario(N, t_end), folder / f"c{N}").directory
     cc = codegen.compiler()
@@ -165,40 +180,44 @@ def exported(N: int, t_end: float, folder: Path, passes: int) -> dict[str, Times
         item.u_last[0] = numbers[at]
         inputs.append(item)
     feedback, whole = Times(), Times()
-    for _ in range(passes):
+
+    def once() -> None:
         library.mpc_reset()
         for item in inputs:
             feedback.measure(lambda i=item: library.mpc_step(ctypes.byref(i), output))
-            preparation = Times()
-            preparation.measure(lambda: library.mpc_prepare(output))
-            whole.cpu.append(feedback.cpu[-1] + preparation.cpu[0])
-            whole.wall.append(feedback.wall[-1] + preparation.wall[0])
-    return {"exported C, feedback": feedback, "exported C, preparation and feedback": whole}
+            whole.together(feedback, lambda: library.mpc_prepare(output))
+
+    return Contestant({"exported C, feedback": feedback, "exported C, preparation and feedback": whole}, once, passes)
 
 
-def slsqp(N: int, t_end: float, asked: Sequence[Any]) -> dict[str, Times]:
+def slsqp(N: int, t_end: float, asked: Sequence[Any], passes: int) -> Contestant:
     """Single shooting with finite differences on the compiled prediction."""
     _, session = prepared(N, t_end)
     shooting = session.solver
     model, problem, condensed = shooting.kernel.model, shooting.problem, shooting.condensed
     outputs = [model.position("y", path) for path in condensed.outputs()]
     predictor = Predictor(shooting.kernel, [model.position("u", COMMAND)], outputs, N, shooting.rule)
-    times, plan = Times(), None
-    for sample, u_last in asked:
-        state = sample.state
-        horizon = shooting.horizons.at(sample.t, state.u, sample.p)
-        references = problem.references(sample.t)
+    times = Times()
+    low, high = problem.u_min[0], problem.u_max[0]
 
-        def cost(u: np.ndarray, *, s: Any = state, ho: Any = horizon, re: Any = references, ul: Any = u_last) -> float:
-            rollout = predictor.roll(s, u[:, None], ho, derivatives=False)
-            return 1e6 if rollout is None else condensed.cost(rollout.y, re, u[:, None], ul)
+    def once() -> None:
+        plan = None
+        for sample, u_last in asked:
+            horizon = shooting.horizons.at(sample.t, sample.state.u, sample.p)
+            references = problem.references(sample.t)
 
-        start = np.tile(u_last, N) if plan is None else np.append(plan[1:], plan[-1])
-        bounds = [(problem.u_min[0], problem.u_max[0])] * N
-        found = times.measure(lambda c=cost, s=start, b=bounds: minimize(c, s, method="SLSQP", bounds=b))
-        plan = np.clip(found.x, problem.u_min[0], problem.u_max[0])
-        times.commands.append(float(plan[0]))
-    return {"scipy SLSQP": times}
+            def cost(
+                u: np.ndarray, s: Any = sample.state, ho: Any = horizon, r: Any = references, ul: Any = u_last
+            ) -> float:
+                rollout = predictor.roll(s, u[:, None], ho, derivatives=False)
+                return 1e6 if rollout is None else condensed.cost(rollout.y, r, u[:, None], ul)
+
+            start = np.tile(u_last, N) if plan is None else np.append(plan[1:], plan[-1])
+            found = times.measure(lambda c=cost, x=start: minimize(c, x, method="SLSQP", bounds=[(low, high)] * N))
+            plan = np.clip(found.x, low, high)
+            times.commands.append(float(plan[0]))
+
+    return Contestant({"scipy SLSQP": times}, once, passes)
 
 
 def ordinary(simulation: Simulation) -> tuple[ca.SX, ca.SX, ca.SX, list[ca.SX]]:
@@ -223,19 +242,21 @@ def ordinary(simulation: Simulation) -> tuple[ca.SX, ca.SX, ca.SX, list[ca.SX]]:
     return x, u, fault, [f[moving], y[model.position("y", "unit.G2.v_t")], y[model.position("y", "unit.G2.omega")]]
 
 
-def do_mpc(N: int, t_end: float, asked: Sequence[Any], folder: Path) -> dict[str, Times]:
-    """do-mpc as its documentation sets it up; then the same with its program compiled, where that works."""
+def do_mpc(N: int, t_end: float, asked: Sequence[Any], folder: Path, passes: int) -> list[Contestant]:
+    """do-mpc as its documentation sets it up; then the same with its program compiled."""
     with warnings.catch_warnings(), contextlib.redirect_stdout(sys.stderr):
         warnings.simplefilter("ignore")
         import do_mpc as library
 
-        return {
-            name: _do_mpc(library, N, t_end, asked, folder if compiled else None)
-            for name, compiled in (("do-mpc as shipped", False), ("do-mpc, program compiled", True))
-        }
+        return [
+            _do_mpc(library, N, t_end, asked, passes, None),
+            _do_mpc(library, N, t_end, asked, passes, folder),
+        ]
 
 
-def _do_mpc(library: Any, N: int, t_end: float, asked: Sequence[Any], compile_in: Path | None) -> Times:
+def _do_mpc(
+    library: Any, N: int, t_end: float, asked: Sequence[Any], passes: int, compile_in: Path | None
+) -> Contestant:
     simulation, session = prepared(N, t_end)
     problem = session.solver.problem
     sx, su, sfault, expressions = ordinary(simulation)
@@ -273,16 +294,20 @@ def _do_mpc(library: Any, N: int, t_end: float, asked: Sequence[Any], compile_in
     moving = ~simulation.model.inert
     position = simulation.model.position("p", FAULT)
     times = Times()
-    for k, (sample, u_last) in enumerate(asked):
-        x_0 = sample.state.x[moving][:, None]
-        now[0] = float(sample.p[position])
-        mpc.u0 = u_last[:, None]
-        if k == 0:
-            mpc.x0 = x_0
-            mpc.set_initial_guess()
-        found = times.measure(lambda v=x_0: mpc.make_step(v))
-        times.commands.append(float(found[0, 0]))
-    return times
+
+    def once() -> None:
+        for k, (sample, u_last) in enumerate(asked):
+            x_0 = sample.state.x[moving][:, None]
+            now[0] = float(sample.p[position])
+            mpc.u0 = u_last[:, None]
+            if k == 0:
+                mpc.x0 = x_0
+                mpc.set_initial_guess()
+            found = times.measure(lambda v=x_0: mpc.make_step(v))
+            times.commands.append(float(found[0, 0]))
+
+    name = "do-mpc as shipped" if compile_in is None else "do-mpc, program compiled"
+    return Contestant({name: times}, once, passes)
 
 
 def _compile(N: int, where: Path) -> str:
@@ -294,6 +319,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--horizons", type=int, nargs="+", default=[5, 10, 20])
     parser.add_argument("--passes", type=int, default=30, help="of the fast solvers through the sequence")
+    parser.add_argument("--slow-passes", type=int, default=3, help="of the others")
     parser.add_argument("--t-end", type=float, default=3.0)
     told = parser.parse_args()
     there = importlib.util.find_spec("do_mpc") is not None
@@ -303,10 +329,19 @@ def main() -> None:
         folder = Path(name)
         for N in told.horizons:
             asked, reference = sequence(N, told.t_end)
-            found = real_time_iteration(N, told.t_end, asked, told.passes)
-            found |= exported(N, told.t_end, folder, told.passes)
-            found |= slsqp(N, told.t_end, asked)
-            found |= do_mpc(N, told.t_end, asked, folder) if there else {}
+            all_of_them = [
+                real_time_iteration(N, told.t_end, asked, told.passes),
+                exported(N, told.t_end, folder, told.passes),
+                slsqp(N, told.t_end, asked, told.slow_passes),
+                *(do_mpc(N, told.t_end, asked, folder, told.slow_passes) if there else []),
+            ]
+            # By turns, so that whatever else the machine does hits them all.
+            for k in range(told.passes):
+                for one in all_of_them:
+                    if k * one.passes // told.passes < (k + 1) * one.passes // told.passes:
+                        with contextlib.redirect_stdout(sys.stderr):
+                            one.once()
+            found = {name: times for one in all_of_them for name, times in one.times.items()}
             rows += [{"N": N, "solver": solver, **times.row(reference)} for solver, times in found.items()]
     about = {"machine": f"{platform.machine()}, {os.cpu_count()} processors", "load": os.getloadavg(), "rows": rows}
     print(json.dumps(about, indent=1))
