@@ -71,6 +71,10 @@ def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healt
         if not segment.failed:
             break
         fine /= 8
+    worst, residual = _worst_equation(kernel, last, p, h)
+    if not np.isfinite(residual):
+        text = f"the equation of {worst} has no finite value at t = {state.t:.4f} s"
+        return Outcome(Ending.DIVERGED, state.t, worst, text)
     jacobian = algebraic_jacobian(kernel, last, p)
     settled = kernel.settle(last, p)
     singular = np.linalg.svd(jacobian)
@@ -80,7 +84,6 @@ def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healt
             f"voltage collapse at bus {bus}: from t = {state.t:.4f} s on no voltage satisfies the network and its loads"
         )
         return collapse(kernel.model, state, bus, text)
-    worst = _worst_equation(kernel, last, p, h)
     text = f"the step after t = {state.t:.4f} s has no solution; the equation furthest from being satisfied is that of {worst}"
     return Outcome(Ending.DIVERGED, state.t, worst, text)
 
@@ -100,10 +103,12 @@ def _weakest_bus(model: Model, direction: Array) -> str:
     return max(size, key=lambda name: size[name])
 
 
-def _worst_equation(kernel: Kernel, state: State, p: Array, h: float) -> str:
+def _worst_equation(kernel: Kernel, state: State, p: Array, h: float) -> tuple[str, float]:
+    """The row furthest from being satisfied by a step that stays at ``state``, and its residual; infinite where it has no value."""
     model = kernel.model
     mass = np.array(model.dae(state.x, state.z, state.d, state.u, p, h)[1]).ravel()
     w = np.concatenate((state.x, state.z))
     r = np.array(kernel.functions.residual(w, mass * state.x, h, state.d, state.u, p)[0]).ravel()
     r[~np.isfinite(r)] = np.inf
-    return str((*model.x_names, *model.z_names)[int(np.argmax(np.abs(r)))])
+    k = int(np.argmax(np.abs(r)))
+    return str((*model.x_names, *model.z_names)[k]), float(abs(r[k]))
