@@ -113,9 +113,7 @@ def linearise(model: Model, state: State, p: Array) -> Linearisation:
     for at, bound in ((at_upper, "upper"), (at_lower, "lower")):
         rows_f[at] = unit[at] - derivatives[bound][at]
     algebraic = at_upper | at_lower | (mass == 0)
-    # With a mass that is a parameter (a reference machine with H = 0) a row may vanish at this point without doing so symbolically.
-    at_rest = (f == 0) & ~derivatives["f"].any(axis=1)
-    dynamic = ~algebraic & ~model.inert & ~at_rest
+    dynamic = ~algebraic & ~model.inert & ~_at_rest(f, derivatives["f"])
     n_w = n_x + len(model.z_names)
     solved = np.concatenate((algebraic, np.ones(n_w - n_x, dtype=bool)))
     moving = np.concatenate((dynamic, np.zeros(n_w - n_x, dtype=bool)))
@@ -140,6 +138,22 @@ def linearise(model: Model, state: State, p: Array) -> Linearisation:
     return Linearisation(
         A, B, C, D, tuple(names[dynamic]), model.u_names, model.y_names, tuple(names[at_upper | at_lower])
     )
+
+
+def _at_rest(f: Array, rows: Array) -> NDArray[np.bool_]:
+    """States that nothing moves though their rows do not vanish symbolically: speed and angle of a machine with ``H = 0``.
+
+    A row may depend on states that are at rest themselves.
+    """
+    n_x = f.size
+    found = np.zeros(n_x, dtype=bool)
+    while True:
+        moving = rows.copy()
+        moving[:, :n_x][:, found] = 0.0
+        more = (f == 0) & ~moving.any(axis=1)
+        if np.array_equal(more, found):
+            return found
+        found = more
 
 
 def _derivatives(model: Model, state: State, p: Array) -> tuple[Array, Array, Array, Array, dict[str, Array]]:
