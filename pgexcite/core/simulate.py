@@ -265,11 +265,21 @@ class Simulation:
             raise ConfigError(problems)
 
     def _apply_due(self) -> None:
-        while self._pending and self._boundary(self._pending[0]) <= self.state.k and not self._ended():
-            self._apply(self._pending.pop(0))
+        due = []
+        while self._pending and self._boundary(self._pending[0]) <= self.state.k:
+            due.append(self._pending.pop(0))
+        if due:
+            self._apply(*due)
 
-    def _apply(self, change: Change) -> None:
+    def _apply(self, *changes: Change) -> None:
+        """Changes of one boundary, in their order; only what they make together needs to have a solution."""
         u, p = self.state.u.copy(), self.p.copy()
+        for change in changes:
+            self._enter(change, u, p)
+        self._jump(u, p)
+
+    def _enter(self, change: Change, u: Array, p: Array) -> None:
+        """Write a change into commands and parameters, and into the log."""
         for values, add in ((change.values, False), (change.increments or {}, True)):
             for path, value in values.items():
                 if _switched(path):
@@ -281,7 +291,6 @@ class Simulation:
                 array[k] = array[k] + value if add else value
         moved = "" if abs(self.state.t - change.t) < 1e-9 else f" (asked for at t = {change.t:g} s)"
         self._recording.log.append(LogEntry(self.state.t, "event", change.text + moved))
-        self._jump(u, p)
 
     def _jump(self, u: Array, p: Array) -> None:
         """New commands and parameters: the algebraic unknowns are solved again at fixed states."""
