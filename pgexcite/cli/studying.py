@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
@@ -32,7 +33,7 @@ def study(config: Path, out: Path | None, workers: int, as_json: bool) -> None:
     from pgexcite.studies.sweep import run_study
 
     def progress(done: int, total: int) -> None:
-        if click.get_text_stream("stderr").isatty():
+        if sys.stderr.isatty():
             click.echo(f"\r{done} of {total} cases", err=True, nl=done == total)
 
     found = run_study(config, out or Path("runs") / config.stem, workers=workers, progress=progress)

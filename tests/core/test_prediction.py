@@ -106,7 +106,14 @@ def test_a_known_disturbance_inside_a_sample(rule, transitions):
     faulted = sim.p.copy()
     for path, value in FAULT.changes()[0].values.items():
         faulted[sim.model.position("p", path)] = value
-    pieces = [(10, 0, 0, 1), (4, 1, 1, 0), (6, 1, 1, 1), (10, 2, 1, 1), (4, 2, 1, 0), (6, 2, 0, 1)]  # steps, move, row, end
+    pieces = [
+        (10, 0, 0, 1),
+        (4, 1, 1, 0),
+        (6, 1, 1, 1),
+        (10, 2, 1, 1),
+        (4, 2, 1, 0),
+        (6, 2, 0, 1),
+    ]  # steps, move, row, end
     sim.restart(Fault(type="fault", t=0.1, bus="HV", R=0.02, duration=0.12).changes())
     sim.run(until=0.05)
     counts, moves, rows, ends = (np.array(column, dtype=np.int32) for column in zip(*pieces, strict=True))

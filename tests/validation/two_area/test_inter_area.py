@@ -1,6 +1,7 @@
 """Inter-area damping: predictive control of all four fields against static exciters with stabilisers.
 
-The stabilisers' figures agree with the linearised system; those of MPC have no linear counterpart and are taken from the trajectory.
+The stabilisers' figures agree with the linearised system; those of MPC have no linear counterpart and are taken from the
+trajectory.
 """
 
 from __future__ import annotations
