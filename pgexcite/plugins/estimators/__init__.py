@@ -1,0 +1,1 @@
+"""Estimators of what a unit's terminals do not show."""

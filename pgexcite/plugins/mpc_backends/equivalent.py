@@ -1,0 +1,166 @@
+"""Nonlinear MPC on what can be known at the unit: an estimated machine on an estimated equivalent infinite bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pgexcite.core.controller import Plant, Sample, Surroundings, as_arrays
+from pgexcite.core.declare import par
+from pgexcite.core.equivalent import TERMINALS, Equivalent
+from pgexcite.core.errors import ConfigError, Problem, RegistryError
+from pgexcite.core.estimation import Estimate, Estimator, Observer
+from pgexcite.core.model import State
+from pgexcite.core.mpc import Problem as ControlProblem
+from pgexcite.core.mpc import Solution, Solver
+from pgexcite.core.registry import find
+from pgexcite.core.shooting import Shooting, ShootingOptions
+
+Array = NDArray[np.float64]
+
+
+class EquivalentMPC(BaseModel):
+    """NMPC that sees the unit's terminals only.
+
+        v_t, P, Q, omega, E_fd --> [ estimator ] --> rotor states, P_m, x_s, v_bus --> [ NMPC on this equivalent ] --> E_fd
+
+    The prediction is that of ``nmpc``, of another network: the rest of the grid is an infinite bus behind ``x_s``. Nothing to come
+    is known but changes of ``V_ref``. Angles are against the equivalent bus, and so is the speed in the cost.
+
+    With ``delayed`` measurements the estimate is of the instant they were taken at.
+
+    Not modelled: other units, loads, the reaction of the turbine, the exciter's ceiling (bound the command instead).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    information: ClassVar[Literal["measured"]] = "measured"
+
+    estimator: str = Field("ukf", description="registered name of the estimator")
+    estimation: Mapping[str, Any] = Field(default_factory=dict, description="parameters of the estimator")
+    model: Mapping[str, float] = Field(
+        default_factory=dict, description="parameters of its own machine that are not the nameplate's, by path"
+    )
+    iterations: int = par(3, "-", "QPs solved for one plan at the most", ge=1)
+    tolerance: float = par(1e-4, "pu", "largest change of a command at which a plan has converged", gt=0)
+    step: float = par(0.0, "s", "longest prediction step in the first interval; 0 takes the simulation's", ge=0)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        self._estimator()
+        return self
+
+    def _estimator(self) -> Estimator:
+        try:
+            estimator: Estimator = find("estimator", self.estimator).model_validate(dict(self.estimation))
+        except RegistryError as cause:
+            raise ValueError(str(cause)) from cause
+        return estimator
+
+    def start(self, problem: ControlProblem, surroundings: Surroundings, plant: Plant | None) -> Solver:
+        """Begin a run; a plant is not looked at.
+
+        Raises:
+            ConfigError: the problem is not one of a single unit's field voltage and its own terminals.
+            InitialisationError: the equivalent has no steady state at the initial point.
+        """
+        return _Equivalent(self, self._estimator(), problem, surroundings)
+
+
+class _Equivalent(Shooting):
+    """Shooting from the estimate, on the estimate."""
+
+    def __init__(
+        self, options: EquivalentMPC, estimator: Estimator, problem: ControlProblem, surroundings: Surroundings
+    ) -> None:
+        unit = problem.commands[0].rpartition(".")[0].rpartition(".")[0]
+        self._equivalent = Equivalent(surroundings, unit, estimator.x_s, options.model, "options.model")
+        self._observer: Observer = estimator.start(self._equivalent, problem.dt, surroundings.compile)
+        self._paths = [f"{unit}.{name}" for name in TERMINALS]
+        self._field = f"{unit}.e_fd"
+        shooting = ShootingOptions(mode="converged", max_iterations=options.iterations, tolerance=options.tolerance)
+        h = problem.dt / np.ceil(problem.dt / (options.step or surroundings.h) - 1e-9)
+        own = _translated(problem, self._equivalent)
+        super().__init__(self._equivalent.kernel, own, shooting, rule="tr_bdf2", h=h, grid=surroundings.h)
+        self._offset = self._equivalent.offset
+        self._seen = self._sent = np.array([surroundings.y_0[self._field]])
+        self._in_charge = False
+        self._told: Mapping[str, float] = {}
+
+    # The protocol of a solver: commands of the plant outside, of the equivalent inside.
+
+    def solve(self, sample: Sample, u_last: Array) -> Solution:
+        """The plan from this sample on; see ``pgexcite.core.mpc.Solver``."""
+        solution = super().solve(sample, u_last + self._offset)
+        return replace(solution, u=solution.u - self._offset, diagnostics=self._told)
+
+    def prepare(self, u: Array) -> None:
+        """Keep what was sent: it is in force until the next sample."""
+        self._sent = np.array(u)
+
+    def memory(self) -> Mapping[str, Array]:
+        """Plan, estimate, and the field voltages seen and sent last."""
+        own = as_arrays({"seen": self._seen, "sent": self._sent, "in_charge": self._in_charge})
+        return {**super().memory(), **own, **{f"observer:{key}": v for key, v in self._observer.memory().items()}}
+
+    def recall(self, memory: Mapping[str, Array]) -> None:
+        """Take up where ``memory`` left off."""
+        super().recall(memory)
+        self._seen, self._sent, self._in_charge = memory["seen"], memory["sent"], bool(memory["in_charge"] > 0)
+        start = "observer:"
+        self._observer.recall({k.removeprefix(start): v for k, v in memory.items() if k.startswith(start)})
+
+    # Where the equivalent is.
+
+    def locate(self, sample: Sample) -> State | None:
+        """The equivalent's state by the estimator; ``None`` where that has diverged."""
+        terminals = np.array([sample.measured[path] for path in self._paths])
+        field = np.array([sample.measured[self._field]])
+        whole = bool(np.isfinite(terminals).all() and np.isfinite(field).all())
+        estimate = self._observer.observe(terminals if whole else None, self._since_last(field if whole else None))
+        self._in_charge = sample.active
+        self._told = estimate.diagnostics
+        return self._settled(sample.t, estimate) if estimate.sound else None
+
+    def _since_last(self, field: Array | None) -> float:
+        """The equivalent's field voltage since the last sample, of which ``field`` was measured at the end."""
+        before, self._seen = self._seen, self._sent if field is None else field
+        # In charge it was constant. A regulator moved it; its two ends are known.
+        mean = self._seen if self._in_charge else (before + self._seen) / 2
+        return float(mean[0]) + self._offset
+
+    def _settled(self, t: float, estimate: Estimate) -> State | None:
+        start = self._equivalent.initial.state
+        x, u, self.p = self._equivalent.point(estimate.value, float(self._seen[0]) + self._offset)
+        return self.kernel.settle(State(0, t, x, start.z, start.d, u), self.p)
+
+
+def _translated(problem: ControlProblem, equivalent: Equivalent) -> ControlProblem:
+    """The problem in the equivalent's paths and commands.
+
+    Raises:
+        ConfigError: it commands or tracks what the equivalent does not have.
+    """
+    unit, outputs = equivalent.unit, equivalent.initial.model.index["y"]
+    problems = []
+    if len(problem.commands) > 1 or problem.commands[0].rpartition(".")[2] not in ("e_fd_cmd", "e_fd_ref"):
+        text = "the equivalent backend commands the field voltage of one unit"
+        problems.append(Problem("controller.command", text, ", ".join(problem.commands), 'command = "e_fd"'))
+    for path in (*problem.voltages, *(bound.path for bound in problem.soft)):
+        if path not in outputs or not path.startswith(f"{unit}."):
+            text = f"the equivalent knows the unit's own outputs only ({unit}.v_t, .i_fd, .delta, ...)"
+            problems.append(Problem("controller", text, path))
+    if problems:
+        raise ConfigError(problems)
+    return replace(
+        problem,
+        commands=(equivalent.command,),
+        u_min=problem.u_min + equivalent.offset,
+        u_max=problem.u_max + equivalent.offset,
+        known=(),
+        fixed={},
+    )
