@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
+import casadi as ca
+
 from pgexcite.core.blocks import clip, der, integrator, lag
 from pgexcite.core.component import Equations, Signals, Terminal
 from pgexcite.core.declare import par, setpoint, state
 from pgexcite.core.roles import Governor
+
+_LEAKAGE = 1e-4
+"""Gate opening, pu, that the water column still sees at a closed gate: with none the head ``(q / gate)^2`` would be 0/0."""
 
 
 class HYGOV(Governor):
@@ -18,10 +23,10 @@ class HYGOV(Governor):
         omega - 1 (-)                                                                   |
         R c ------(-)-------------------------------------------------------------------+
 
-        T_w q' = 1 - h,    h = (q / gate)^2        p_m = A_t h (q - q_NL) - D_turb gate (omega - 1)
+        T_w q' = 1 - h,    h = q |q| / gate^2      p_m = A_t h (q - q_NL) - D_turb gate (omega - 1)
 
     ``holds`` says what ``p_m`` is to the machine: ``"power"`` (PSS/E) gives ``t_m = p_m / omega``, ``"torque"`` gives
-    ``t_m = p_m``. The gate's end stops do not wind up.
+    ``t_m = p_m``. The gate's end stops do not wind up. To the head a gate below 0.0001 pu is one of 0.0001 pu: it leaks.
 
     Not modelled: elasticity of the water column, surge tank, dead band, the turbine's efficiency curve.
     """
@@ -56,7 +61,9 @@ class HYGOV(Governor):
         wanted = (v.x_f + self.T_r * (error - v.x_f) / self.T_f) / (self.r * self.T_r)
         desired = integrator(clip(wanted, -self.VELM, self.VELM, "gate speed"), v.c, lower=self.G_MIN, upper=self.G_MAX)
         gate = lag(desired.y, v.g, T=self.T_g)
-        head = (v.q / gate.y) * (v.q / gate.y)
+        opening = ca.fmax(gate.y, _LEAKAGE)
+        # With the flow's sign: the square alone rests with the flow running back, too, which a long step can fall into.
+        head = v.q * ca.fabs(v.q) / (opening * opening)
         flow = der(v.q, 1 - head, T=self.T_w)
         p_m = self.A_t * head * (v.q - self.q_NL) - self.D_turb * gate.y * deviation
         t_m = p_m / v.omega if self.holds == "power" else p_m

@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from component_harness import Bench, simulate
+from plants import kobbelv
 from pydantic import ValidationError
 
+from pgexcite.core.events import Change
+from pgexcite.core.settings import Settings
+from pgexcite.core.simulate import Simulation
+from pgexcite.core.trace import Ending
 from pgexcite.plugins.governors.hygov import HYGOV
 from pgexcite.plugins.governors.tgov1 import TGOV1
 
@@ -81,7 +86,7 @@ def test_hygov_gate_speed_and_end_stops():
     _t, run = simulate(Bench(governor), start, lambda t: {"omega": 1.0 - 0.05 * (t >= 1)}, t_end=20.0)
     assert np.max(np.diff(run["c"])) / 1e-3 == pytest.approx(0.05, rel=1e-6)
     assert run["c"].max() == 0.9
-    down = simulate(Bench(governor), start, lambda t: {"omega": 1.0 + 0.08 * (t >= 1)}, t_end=40.0, h=2e-3)[1]
+    down = simulate(Bench(governor), start, lambda t: {"omega": 1.0 + 0.08 * (t >= 1)}, t_end=23.0, h=2e-3)[1]
     assert down["c"].min() == 0.0
 
 
@@ -93,6 +98,18 @@ def test_hygov_water_answers_the_wrong_way_first():
     first = run["t_m"][(t > 1.0) & (t < 2.0)]
     assert first.min() < 0.78
     assert run["t_m"][-1] > 0.9
+
+
+@pytest.mark.parametrize("T_g", [0.0, 0.5])
+def test_hygov_closes_its_gate(T_g):
+    """The flow stops with the gate, and what is left is the loss at no load."""
+    governor = HYGOV(T_g=T_g, holds="torque")
+    close = Change(0.5, {"unit.G2.governor.n_ref": -0.2}, "stop")
+    sim = Simulation(kobbelv(governor=governor), Settings(20.0, 0.02, compile="never"), [close])
+    assert sim.run().ending is Ending.COMPLETED
+    assert sim.get("unit.G2.governor.g") == pytest.approx(0.0, abs=1e-9)  # measured 0 and 2e-13
+    assert sim.get("unit.G2.governor.q") == pytest.approx(1e-4, abs=1e-9)  # the leakage
+    assert sim.get("unit.G2.t_m") == pytest.approx(governor.A_t * (1e-4 - governor.q_NL), abs=1e-9)
 
 
 def test_limits_in_the_wrong_order_are_refused():
