@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -26,6 +27,11 @@ class Change:
     values: Mapping[str, float]
     text: str
     increments: Mapping[str, float] | None = None
+
+
+def boundary(t: float, h: float) -> int:
+    """The step boundary at which something asked for at ``t`` (s) happens, with steps of ``h`` (s)."""
+    return math.ceil(t / h - 1e-6)
 
 
 class _Event(BaseModel):

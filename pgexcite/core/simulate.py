@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pgexcite.core.controller import Controller, Plant, Sample, Session, Surroundings
 from pgexcite.core.diagnose import collapse, diagnose, smallest_singular_value
 from pgexcite.core.errors import ConfigError, Problem, SnapshotError
-from pgexcite.core.events import Change
+from pgexcite.core.events import Change, boundary
 from pgexcite.core.initialise import Initial, initialise
 from pgexcite.core.measurement import Instruments
 from pgexcite.core.model import Model, State
@@ -217,7 +217,7 @@ class Simulation:
         return min(stops)
 
     def _boundary(self, change: Change) -> int:
-        return int(np.ceil(change.t / self.settings.h - 1e-6))
+        return boundary(change.t, self.settings.h)
 
     def _advance(self, n: int) -> None:
         before = self.state

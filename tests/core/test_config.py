@@ -25,6 +25,11 @@ def scenario():
     }
 
 
+def _fault(t, duration):
+    ends = {} if duration is None else {"duration": duration}
+    return {"type": "fault", "t": t, "bus": "A", **ends}
+
+
 def problems(data):
     with pytest.raises(ConfigError) as caught:
         from_data(data)
@@ -207,6 +212,23 @@ WRONG = [
         "event.0",
         "exactly one of value and step",
     ),
+    (
+        lambda d: d.update(event=[{"t": 1.001, "type": "fault", "bus": "A", "duration": 0.003}]),
+        "event.0.duration",
+        "ends on the step boundary it begins on",
+    ),
+    (
+        lambda d: d.update(event=[{"t": 1, "type": "line_trip", "name": "L1", "reclose_after": 1e-9}]),
+        "event.0.reclose_after",
+        "ends on the step boundary it begins on",
+    ),
+    (
+        lambda d: d.update(event=[_fault(1.0, 0.1), _fault(1.05, 0.15)]),
+        "event.1.t",
+        "bus A is still faulted then by event.0",
+    ),
+    (lambda d: d.update(event=[_fault(1.0, 0.1), _fault(0.5, None)]), "event.0.t", "still faulted then by event.1"),
+    (lambda d: d.update(event=[_fault(1.0, 0.1), _fault(1.1, 0.1)]), "event.1.t", "let it begin a step later"),
     (lambda d: d.update(controller={"c": {"model": "pid"}}), "controller.c.model", "there is no such controller"),
     (lambda d: d.update(controller={"c": {"model": "mpc", "unit": "G2"}}), "controller.c.unit", "did you mean 'G1'?"),
     (
@@ -230,6 +252,13 @@ def test_a_single_mistake_is_reported_once_with_path_value_and_advice(spoil, pat
     found = problems(data)
     assert path in found
     assert any(part in found[path] for part in expected.split("|")), found[path]
+
+
+def test_faults_apart_in_time_or_place_are_sound():
+    data = scenario()
+    elsewhere = {**_fault(1.05, 0.1), "bus": "B"}
+    data["event"] = [_fault(1.0, 0.1), elsewhere, _fault(1.105, 0.005)]
+    assert len(from_data(data).changes) == 6
 
 
 def test_all_problems_come_at_once():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, get_args
 
 from pydantic import BaseModel
@@ -11,7 +13,7 @@ from pydantic import BaseModel
 from pgexcite.core import registry
 from pgexcite.core.config.validate import Collector
 from pgexcite.core.declare import Kind
-from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, LoadStep, ParameterStep
+from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, LoadStep, ParameterStep, boundary
 from pgexcite.core.network import Branch
 from pgexcite.core.system import Device, System
 
@@ -89,6 +91,37 @@ def check_event(event: BaseModel, where: str, grid: Grid, collect: Collector) ->
         collect.known("load", event.load, grid.names["load"], f"{where}.load")
     elif isinstance(event, ParameterStep) and not any(event.path.startswith(f"{path}.") for path in grid.broken):
         _check_parameter_step(event, where, grid.system, collect)
+
+
+def check_ends(events: Mapping[int, BaseModel], h: float | None, collect: Collector) -> None:
+    """What ends by itself lasts a step at least, and a fault begins after the one before it at its bus has cleared.
+
+    Args:
+        events: sound events by their number in the file.
+        h: step, s; ``None`` where it is not known.
+    """
+    faults: dict[str, list[tuple[float, float, int]]] = {}
+    for number, event in events.items():
+        if not isinstance(event, Fault | BranchTrip):
+            continue
+        key = "duration" if isinstance(event, Fault) else "reclose_after"
+        lasts = getattr(event, key)
+        end = math.inf if lasts is None else event.t + lasts
+        if lasts is not None and h is not None and boundary(end, h) <= boundary(event.t, h):
+            collect.add(
+                f"event.{number}.{key}",
+                f"ends on the step boundary it begins on: events move to the next whole step of simulation.h = {h:g} s",
+                lasts,
+                "make it longer or simulation.h shorter",
+            )
+        if isinstance(event, Fault):
+            faults.setdefault(event.bus, []).append((event.t, end, number))
+    for bus, there in faults.items():
+        there.sort()
+        for (_, end, first), (begin, _, second) in pairwise(there):
+            if begin <= end or (h is not None and boundary(begin, h) <= boundary(end, h)):
+                text = f"bus {bus} is still faulted then by event.{first}, whose clearing would clear this fault, too"
+                collect.add(f"event.{second}.t", text, begin, "make them one fault, or let it begin a step later")
 
 
 def check_controller(controller: BaseModel, where: str, grid: Grid, h: float | None, collect: Collector) -> None:

@@ -88,7 +88,7 @@ def from_data(data: Mapping[str, Any], path: Path | str = "") -> Scenario:
     if not devices.broken:  # what is left out would make its neighbours look like an island
         checks.check_islands(system, collect)
     checks.check_reference(system.reference, grid, collect)
-    events = _events(document.event, grid, collect)
+    events = _events(document.event, grid, simulation.h if simulation else None, collect)
     controllers = _controllers(document.controller, grid, simulation.h if simulation else None, collect)
     if collect.problems or simulation is None or base is None or record is None:
         raise ConfigError(collect.problems)
@@ -133,8 +133,8 @@ def _document(data: Mapping[str, Any], collect: Collector) -> tables.Document:
         return tables.Document.model_validate(sound)
 
 
-def _events(entries: list[dict[str, Any]], grid: checks.Grid, collect: Collector) -> list[Any]:
-    events = []
+def _events(entries: list[dict[str, Any]], grid: checks.Grid, h: float | None, collect: Collector) -> list[Any]:
+    events: dict[int, Any] = {}
     for number, entry in enumerate(entries):
         where = f"event.{number}"
         if "type" not in entry:
@@ -144,8 +144,9 @@ def _events(entries: list[dict[str, Any]], grid: checks.Grid, collect: Collector
             if event is not None:
                 collect.problems += event.problems(where)
                 checks.check_event(event, where, grid, collect)
-                events.append(event)
-    return events
+                events[number] = event
+    checks.check_ends(events, h, collect)
+    return list(events.values())
 
 
 def _controllers(
