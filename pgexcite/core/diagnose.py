@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pgexcite.core.declare import Kind
 from pgexcite.core.model import Model, State
 from pgexcite.core.settings import Rule
 from pgexcite.core.stage import FROZEN
@@ -17,6 +18,9 @@ _NEARLY_SINGULAR = 0.05
 """Smallest singular value of the algebraic equations, against its value at the start of the run, that counts as singular."""
 _DEVICES = 1e-12
 """Weight of devices' own unknowns against voltages in telling which bus is to blame."""
+_LOWEST_AT_REST = {"v_oel": -1e-9, "v_scl": -1e-9}
+_HIGHEST_AT_REST = {"v_uel": 1e-9, "v_scl": 1e-9}
+"""Limiters' signals, pu, that ask for nothing: an underexcitation limiter's may be low, an overexcitation limiter's high."""
 
 
 def algebraic_jacobian(kernel: Kernel, state: State, p: Array) -> Array:
@@ -44,6 +48,22 @@ def active_devices(model: Model, d: Array) -> tuple[str, ...]:
             position = _discrete(model, d, f"{path}.position") if component.role == "tap_changer" else 0.0
             if position:
                 found.append(f"{path} at {position:+.0f}")
+    return tuple(found)
+
+
+def limiters_at_work(model: Model, y: Array) -> tuple[str, ...]:
+    """Limiters whose signal asks for more or less excitation at outputs ``y``, each with that signal.
+
+    By the sign of what the signal is for: an underexcitation limiter raises (``v_uel`` above zero), an overexcitation limiter
+    lowers (``v_oel`` below zero), a stator-current limiter does either. Whether a gate selects the signal is not told.
+    """
+    found = []
+    for device in model.system.devices:
+        for slot, component in device.components.items():
+            for port in component.variables(Kind.OUTPUT) if component.role == "limiter" else ():
+                signal = float(y[model.position("y", f"{device.path}.{port.name}")])
+                if _LOWEST_AT_REST.get(port.name, -np.inf) > signal or _HIGHEST_AT_REST.get(port.name, np.inf) < signal:
+                    found.append(f"{device.component_path(slot)}: {port.name} = {signal:.4g} pu")
     return tuple(found)
 
 

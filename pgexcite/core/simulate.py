@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.controller import Controller, Plant, Sample, Session, Surroundings
-from pgexcite.core.diagnose import collapse, diagnose, smallest_singular_value
+from pgexcite.core.diagnose import collapse, diagnose, limiters_at_work, smallest_singular_value
 from pgexcite.core.errors import ConfigError, Problem, SnapshotError
 from pgexcite.core.events import Change, boundary
 from pgexcite.core.initialise import Initial, initialise
@@ -124,6 +124,8 @@ class Simulation:
         self._recording = _Recording()
         self._running = {name: self._start(name, controller) for name, controller in self._controllers.items()}
         self._record_point()
+        at_work = limiters_at_work(self.model, self.kernel.outputs(self.state, self.p))
+        self._recording.log += [LogEntry(0.0, "limit", f"{text} at the initial point already") for text in at_work]
 
     # Parameters and commands, at any time.
 

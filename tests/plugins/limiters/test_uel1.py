@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from component_harness import Bench
@@ -8,6 +10,7 @@ from plants import regulated
 from pgexcite.core.events import ParameterStep
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
+from pgexcite.core.system import Schedule
 from pgexcite.plugins.exciters.st1a import ST1A
 from pgexcite.plugins.limiters.uel1 import UEL1
 
@@ -76,3 +79,16 @@ def test_it_holds_the_machine_on_its_circle(exciter, limiter):
 
     assert end() > 0.2
     assert end(**{"limiter.uel": limiter}) == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("radius", "told"), [(1.3, True), (1.95, False)])
+def test_a_limiter_that_works_at_the_initial_point_is_in_the_log(radius, told):
+    system = regulated(exciter=ST1A(uel_position=1), uel=UEL1(K_UC=1.0, K_UR=radius, K_UL=1.0, V_UIMIN=0.0))
+    low = replace(system.devices[0], schedule=Schedule(P=0.5 * 175, Q=-0.5 * 175, V=1.0))
+    system = replace(system, devices=(low, *system.devices[1:]))
+    trace = Simulation(system, Settings(0.1, 0.01, "tr_bdf2", "never")).trace()
+    assert [(entry.t, entry.kind) for entry in trace.log] == [(0.0, "limit")] * told
+    signal = trace["unit.G2.v_uel"][0]
+    assert (signal > 0) == told
+    if told:
+        assert trace.log[0].text == f"unit.G2.uel: v_uel = {signal:.4g} pu at the initial point already"
