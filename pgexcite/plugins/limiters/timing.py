@@ -22,8 +22,10 @@ class TimedLimiter(Limiter):
         timer >= T_LIM      ->  active = 1, the timer stays where it is
         active, and current < K_RESET limit for T_RESET  ->  active = 0, the timer cools down
 
-    The clock runs in the step's discrete map: a delay ends on the first step boundary at which it has passed in full. An overload
-    that comes back before the timer has cooled down is tolerated for the rest of ``T_LIM`` only.
+    The clock runs in the step's discrete map. It looks at the current at the end of each step and counts the whole step by it: a
+    delay is exact after an event, which moves the current at the step's beginning, and ends up to one step early where the current
+    crossed its threshold smoothly within a step. An overload that comes back before the timer has cooled down is tolerated for the
+    rest of ``T_LIM`` only.
     """
 
     timing: Literal["fixed", "inverse"] = par("fixed", "-", "whether an overload's time depends on its size")

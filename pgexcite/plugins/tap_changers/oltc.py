@@ -25,8 +25,10 @@ class OLTC(TapChanger):
         ratio = tap + step * position,  kept within tap_min .. tap_max
 
     The timer starts when the voltage leaves the dead band and is reset when it returns, when it crosses to the other side, and by a
-    tap, which falls on the first step boundary at which the voltage has been outside for the whole delay. With the bus at
-    the receiving end a high voltage raises the ratio; at the sending end it lowers it. Position 0 is the transformer's own ``tap``.
+    tap. It looks at the voltage at the end of each step and counts the whole step if the voltage is outside then: a delay is exact
+    after an event, which moves the voltage at the step's beginning, and ends up to one step early where the voltage slid out of the
+    dead band within a step. With the bus at the receiving end a high voltage raises the ratio; at the sending end it lowers it.
+    Position 0 is the transformer's own ``tap``.
 
     Not modelled: the voltage transducer, delays that shorten with the deviation, the time a tap takes.
     """
@@ -57,7 +59,7 @@ class OLTC(TapChanger):
         side = (1 - self.blocked) * outside
         stays = (side != 0) * (side == v.side)
         repeated = stays * v.repeated
-        # The step just taken counts in full: an event at its beginning is what moved the voltage.
+        # The step just taken counts in full: whether an event at its beginning moved the voltage cannot be seen from its end.
         timer = stays * v.timer + (side != 0) * v.h
         delay = ca.if_else(repeated, self.T_next, self.T_first)
         due = timer >= delay - _ROUNDING

@@ -176,3 +176,11 @@ def test_against_the_automaton_written_out(course):
 def test_a_range_upside_down_is_refused():
     with pytest.raises(ValidationError, match=r"tap_min = 1.3 must be below tap_max = 1.2"):
         OLTC(tap_min=1.3)
+
+
+def test_the_step_in_which_the_voltage_leaves_the_dead_band_counts_in_full():
+    automaton = Automaton(OLTC(V_ref=1.0, half_deadband=0.01, T_first=3.0), v_im=0.0, tap=1.0, h=1.0)
+    assert automaton.step(v_re=0.991)["timer"] == 0.0
+    assert automaton.step(v_re=0.989)["timer"] == 1.0
+    automaton.step()
+    assert automaton.step()["position"] == -1.0
