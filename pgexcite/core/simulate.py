@@ -22,7 +22,7 @@ from pgexcite.core.model import Model, State
 from pgexcite.core.result import ControllerStatistics, RunResult
 from pgexcite.core.settings import Settings
 from pgexcite.core.step import Kernel
-from pgexcite.core.synchronism import RotorAngles
+from pgexcite.core.synchronism import RotorAngles, dead_buses
 from pgexcite.core.system import System
 from pgexcite.core.trace import Ending, LogEntry, Outcome, Trace
 from pgexcite.core.undervoltage import Undervoltage
@@ -296,14 +296,28 @@ class Simulation:
 
     def _jump(self, u: Array, p: Array) -> None:
         """New commands and parameters: the algebraic unknowns are solved again at fixed states."""
+        # A controller's commands leave the parameters alone, and with them the branches in service.
+        was_dead, dead = ((), ()) if p is self.p else (dead_buses(self.model, self.p), dead_buses(self.model, p))
         self.p = p
         self.state = self.state.with_(u=u)
-        settled = self.kernel.settle(self.state, p)
+        # From no voltage the search would find the low-voltage solution of a load that is connected again.
+        revived = self._with_voltages([bus for bus in was_dead if bus not in dead], self.initial.state.z)
+        settled = self.kernel.settle(revived, p)
+        if settled is None and dead:
+            # From the voltage before the cut the search for a constant power or current may run away to infinity.
+            settled = self.kernel.settle(self._with_voltages(dead, np.zeros_like(self.state.z)), p)
         if settled is None:
             self._end(diagnose(self.kernel, self.state, p, self.settings.rule, self.settings.h, self._healthy))
             return
         self.state = settled
         self._record_point()
+
+    def _with_voltages(self, buses: Sequence[str], z: Array) -> State:
+        """The present point with the voltages of these buses taken from ``z``."""
+        rows = [self.model.position("z", f"bus.{bus}.{part}") for bus in buses for part in ("v_re", "v_im")]
+        moved = self.state.z.copy()
+        moved[rows] = z[rows]
+        return self.state.with_(z=moved)
 
     def _record_point(self) -> None:
         s = self.state

@@ -67,6 +67,15 @@ class RotorAngles:
         return row, self.names[unit], float(np.degrees(angles[row, unit]))
 
 
+def dead_buses(model: Model, p: Array) -> tuple[str, ...]:
+    """Buses that no branch in service joins to a machine or a source, at parameters ``p``."""
+    system = model.system
+    live = [b for path, b in system.branches().items() if p[model.position("p", f"{path}.status")] > 0]
+    island = _islands(tuple(system.buses), [(branch.from_bus, branch.to_bus) for branch in live])
+    fed = {island[d.bus] for d in system.devices if any(c.role in {"machine", "source"} for c in d.components.values())}
+    return tuple(bus for bus in system.buses if island[bus] not in fed)
+
+
 def _islands(buses: tuple[str, ...], branches: list[tuple[str, str]]) -> dict[str, str]:
     """The island of each bus, named after one of its buses."""
     of = {bus: bus for bus in buses}
