@@ -43,6 +43,8 @@ class ShootingOptions:
         tolerance: largest change of a command at which a plan has converged.
         exact: whether the state comes out exactly as expected unless something happened (perfect information). A prepared plan
             then needs no derivatives to the state, which many states make dear.
+        candidates: constant plans, evenly from the lower bounds to the upper ones, whose true costs are compared before iterating;
+            the cheapest is where it starts. A tap or a limiter inside the horizon makes minima that no descent leaves.
     """
 
     mode: Literal["rti", "converged"] = "rti"
@@ -51,6 +53,7 @@ class ShootingOptions:
     jump: float = 1e-3
     tolerance: float = 1e-6
     exact: bool = False
+    candidates: int = 0
 
 
 @dataclass(frozen=True)
@@ -241,20 +244,27 @@ class Shooting(ABC):
             rollout = self.predictor.roll(state, plan, horizon, derivatives=True)
             if rollout is not None:
                 return plan, rollout
-        return plans[0], None
+        return (plans[0] if plans else np.empty(0)), None
 
-    def _towards_bounds(self, u_last: Array) -> list[Array]:
-        """All commands to their upper bounds, and to their lower ones, as fast as they may move.
-
-        What else to try where neither the old plan nor holding the command lets the model live through the horizon.
-        """
+    def _levels(self, count: int, u_last: Array) -> list[Array]:
+        """All commands at one of ``count`` levels from their upper bounds to their lower ones, as fast as they may move."""
         problem = self.problem
-        reach = np.arange(1, problem.N_c + 1)[:, None] * problem.du_max
-        return [
-            u_last + np.clip(bound - u_last, -reach, reach)
-            for bound in (problem.u_max, problem.u_min)
-            if np.isfinite(bound).all()
-        ]
+        if not np.isfinite([problem.u_min, problem.u_max]).all():
+            return []
+        levels = np.linspace(problem.u_max, problem.u_min, count)
+        return [self.condensed.reachable(np.tile(level, (problem.N_c, 1)), u_last) for level in levels]
+
+    def _cheapest_first(
+        self, plans: list[Array], state: State, horizon: Horizon, u_last: Array, t: float
+    ) -> list[Array]:
+        """Plans in order of their true costs; those the model cannot be stepped through come last."""
+        references = self.problem.references(t)
+
+        def cost(plan: Array) -> float:
+            rollout = self.predictor.roll(state, plan, horizon, derivatives=False)
+            return np.inf if rollout is None else self.condensed.cost(rollout.y, references, plan, u_last)
+
+        return sorted(plans, key=cost)
 
     def _iterate(self, state: State, t: float, p: Array, u_last: Array, count: int) -> Solution:
         """Gauss-Newton with a line search on the true cost."""
@@ -266,9 +276,12 @@ class Shooting(ABC):
             wanted.insert(0, self.problem.shifted(self._plan))
         starts = [self.condensed.reachable(plan, u_last) for plan in wanted]
         hold = starts[-1]
+        if self.options.candidates:
+            starts += self._levels(self.options.candidates, u_last)
+            starts = self._cheapest_first(starts, state, horizon, u_last, t)
         plan, rollout = self._first(starts, state, horizon)
         if rollout is None:
-            plan, rollout = self._first(self._towards_bounds(u_last), state, horizon)
+            plan, rollout = self._first(self._levels(2, u_last), state, horizon)
         if rollout is None:
             return Solution(Status.PREDICTION_FAILED, hold, np.inf, 0, np.inf)
         cost = self.condensed.cost(rollout.y, references, plan, u_last)

@@ -28,7 +28,8 @@ class NMPC(BaseModel):
 
     With ``mode = "rti"`` a sample solves one quadratic program, prepared before the sample around the plan it expects; where the
     state or the network is not what was expected (a fault), ``jump_iterations`` are made instead. ``"converged"`` iterates every
-    plan to ``tolerance``.
+    plan to ``tolerance``. Taps and limiters inside the horizon make minima that no descent leaves: ``candidates`` constant plans
+    are tried first, and the best is where the iteration starts.
 
     ``mismatch`` makes the model wrong where that is wanted: it predicts with other values of the parameters named, by the same
     equations. The state it starts from remains the plant's own.
@@ -42,6 +43,7 @@ class NMPC(BaseModel):
     jump_iterations: int = par(4, "-", "QPs solved for one plan where the state is not what was expected", ge=1)
     jump: float = par(1e-3, "pu", "difference of a state from what was expected that counts as a jump", gt=0)
     tolerance: float = par(1e-6, "pu", "largest change of a command at which a plan has converged", gt=0)
+    candidates: int = par(0, "-", "constant plans between the bounds tried before iterating; 0 tries none", ge=0)
     mismatch: Mapping[str, float] = Field(
         default_factory=dict, description="parameters the model is wrong about: path -> value it predicts with"
     )
@@ -65,6 +67,7 @@ class NMPC(BaseModel):
             jump=self.jump,
             tolerance=self.tolerance,
             exact=True,
+            candidates=self.candidates,
         )
         return _Perfect(plant.kernel, problem, options, surroundings, h, self._wrong(plant))
 
