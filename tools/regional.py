@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pgexcite import Simulation, load
+from pgexcite import Simulation
 from pgexcite.core.config import from_data, read
 from pgexcite.core.config.files import override
 from pgexcite.core.trace import Outcome, Trace
@@ -35,13 +35,11 @@ VOLTAGES = (
 )
 FIELDS = (r"$i_\mathrm{fd}$, A2 G1 and G2 [pu]", ["unit.A2G1.i_fd", "unit.A2G2.i_fd"])
 REFERENCES = (r"$V_\mathrm{ref}$ [pu]", ["unit.A2G1.exciter.v_ref", "unit.A2G2.exciter.v_ref"])
-BUSES = ("buses [pu]", ["bus.Load.v", "bus.Balsfjord.v", "bus.Ofoten.v"])
 
 MPC = "controller.mpc"
-BALSFJORD = (f'{MPC}.voltages=["bus.Balsfjord.v"]', f"{MPC}.V_ref=1.0")
+BOUNDED = f'{MPC}.soft=[{{signal="i_fd",upper=1.95,weight=3000.0}}]'
 UNKNOWN = f"{MPC}.disturbance_known=false"
 LONG = (f"{MPC}.N_p=12", f"{MPC}.growth=1.4")
-FINE = ("simulation.t_end=400.0",)
 
 Row = dict[str, Any]
 
@@ -80,9 +78,9 @@ FIGURES: dict[str, tuple[str, dict[str, tuple[str, tuple[str, ...]]], tuple[Any,
         "Loss of the link, with and without control of the tap changer",
         {
             "tap changer blocked": ("link_loss_no_oltc", ()),
+            "tap changer at work, not ended at 0.7 pu": ("link_loss", ("simulation.collapse_below=0.0",)),
             "tap changer at work": ("link_loss", ()),
             "both machines of area 2 under classical control": ("link_loss_classical", ()),
-            "tap changer at work, not ended at 0.7 pu": ("link_loss", ("simulation.collapse_below=0.0",)),
         },
         (*VOLTAGES, FIELDS),
     ),
@@ -94,6 +92,7 @@ FIGURES: dict[str, tuple[str, dict[str, tuple[str, tuple[str, ...]]], tuple[Any,
             "NMPC of its terminals, dt 1 s, N_p 1": ("link_loss_nmpc_primary", (f"{MPC}.N_p=1",)),
             "NMPC of its terminals, dt 0.2 s, N_p 10": ("link_loss_nmpc_primary", (f"{MPC}.dt=0.2", f"{MPC}.N_p=10")),
             "NMPC of its terminals, dt 1 s, N_p 12 to 139 s": ("link_loss_nmpc_primary", LONG),
+            "NMPC of its terminals, field current bounded": ("link_loss_nmpc_primary", (BOUNDED,)),
             "NMPC of the tap changer's primary, dt 1 s, N_p 5": ("link_loss_nmpc_primary_oltc", ()),
         },
         (*VOLTAGES, FIELDS),

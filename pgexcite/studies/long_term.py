@@ -70,10 +70,15 @@ def commands_of(controllers: Mapping[str, Controller], setpoints: Mapping[str, f
     return tuple(path for actuator in found if actuator is not None for path in actuator(setpoints).setpoints)
 
 
+def ended(trace: Trace) -> bool:
+    """Whether the run ended before its time."""
+    return bool(trace.log) and trace.log[-1].kind == "outcome"
+
+
 def draw_voltages(
     runs: Mapping[str, Trace], panels: Sequence[tuple[str, Sequence[str]]], path: Path, title: str
 ) -> Path:
-    """Signals of several runs over time.
+    """Signals of several runs over time; a cross marks where a run ended before its time.
 
     Args:
         runs: label -> trace; each has a colour.
@@ -94,6 +99,8 @@ def draw_voltages(
                     linewidth=1.4,
                     label=name if j == 0 else None,
                 )
+            if ended(trace) and signals[0] in trace.columns:
+                ax.plot(trace.t[-1], trace[signals[0]][-1], "x", color=figures.COLOURS[k % len(figures.COLOURS)])
         ax.set_ylabel(label)
         ax.margins(x=0.0, y=0.08)
         if len(signals) > 1:
