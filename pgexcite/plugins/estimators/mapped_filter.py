@@ -6,6 +6,7 @@ filterpy takes one Python call for each sigma point and each measurement, never 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -62,10 +63,19 @@ class Expectation:
     S: Array
     C: Array
 
+    @cached_property
+    def gain(self) -> Array:
+        """Kalman's gain, shape ``(n, n_z)``."""
+        return np.asarray(self.C @ self._weight)
+
     def surprise(self, z: Array) -> float:
         """Normalised innovation squared of a measurement: chi-squared with ``n_z`` degrees of freedom where the model holds."""
         nu = z - self.z
-        return float(nu @ np.linalg.solve(self.S, nu))
+        return float(nu @ self._weight @ nu)
+
+    @cached_property
+    def _weight(self) -> Array:
+        return np.asarray(np.linalg.inv(self.S))
 
 
 class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
@@ -99,10 +109,9 @@ class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has
         self._propagate = Mapped(propagate, self._num_sigmas, compile)
         self._sense = Mapped(sense, self._num_sigmas, compile)
 
-    def begin(self, x: Array, P: Array) -> None:
-        """Start at a state; a measurement may come before the first prediction."""
-        self.x, self.P = x.copy(), P.copy()
-        self.sigmas_f = self.points_fn.sigma_points(x, P)
+    def redraw(self) -> None:
+        """Draw the sigma points of the present state, for a measurement that comes before a prediction."""
+        self.sigmas_f = self.points_fn.sigma_points(self.x, self.P)
 
     def compute_process_sigmas(self, dt: float, fx: Any = None, **given: Any) -> None:
         """All sigma points through the process in one call."""
@@ -119,8 +128,7 @@ class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has
     ) -> tuple[Array, Array]:
         x = Wm @ sigmas
         error = sigmas - x
-        P = error.T @ (Wc[:, None] * error) + Q
-        P[np.diag_indices_from(P)] += (self._share * (x - self.x)) ** 2
+        P = error.T @ (Wc[:, None] * error) + Q + np.diag((self._share * (x - self.x)) ** 2)
         return x, _symmetric(P)
 
     def expect(self, x: Array | None = None, P: Array | None = None) -> Expectation:
@@ -138,7 +146,7 @@ class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has
 
     def correct(self, expected: Expectation, z: Array) -> None:
         """Correct by a measurement."""
-        K = np.linalg.solve(expected.S, expected.C.T).T
+        K = expected.gain
         self.x = np.clip(expected.x + K @ (z - expected.z), self._lower, self._upper)
         self.P = _symmetric(expected.P - K @ expected.C.T)
 
