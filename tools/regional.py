@@ -1,6 +1,6 @@
 """The regional system: pictures like figures 12 to 15 of the paper, and the tables of docs/regional.md.
 
-Run: python tools/regional.py [OUT] [--only figures|mismatch]
+Run: python tools/regional.py [OUT] [--only figures|tables|mismatch]
 """
 
 from __future__ import annotations
@@ -39,6 +39,11 @@ REFERENCES = (r"$V_\mathrm{ref}$ [pu]", ["unit.A2G1.exciter.v_ref", "unit.A2G2.e
 MPC = "controller.mpc"
 BOUNDED = f'{MPC}.soft=[{{signal="i_fd",upper=1.95,weight=3000.0}}]'
 UNKNOWN = f"{MPC}.disturbance_known=false"
+MOVES = f"{MPC}.blocks=[2,3,7]"
+CANDIDATES = f"{MPC}.options.candidates=16"
+# In C the sensitivities to every state, which the linear backend wants, take gcc minutes to compile.
+LINEAR = (f'{MPC}.backend="linear"', f"{MPC}.options={{}}", 'simulation.compile="never"')
+EQUIVALENT = (f'{MPC}.backend="equivalent"', f"{MPC}.options={{}}")
 LONG = (f"{MPC}.N_p=12", f"{MPC}.growth=1.4")
 
 Row = dict[str, Any]
@@ -73,6 +78,21 @@ def table(rows: Mapping[str, Row]) -> str:
     return "\n".join(lines)
 
 
+BACKENDS = {
+    "linear, primary": ("link_loss_nmpc_primary", LINEAR),
+    "linear, primary of the tap changer's voltage": ("link_loss_nmpc_primary_oltc", LINEAR),
+    "linear, secondary": ("link_loss_nmpc_secondary", LINEAR),
+    "linear, limit": ("link_loss_nmpc_secondary_limit", LINEAR),
+    "equivalent, primary, dt 0.1 s, N_p 10": (
+        "link_loss_nmpc_primary",
+        (*EQUIVALENT, f"{MPC}.dt=0.1", f"{MPC}.N_p=10"),
+    ),
+    "equivalent, primary, dt 0.2 s, N_p 10": (
+        "link_loss_nmpc_primary",
+        (*EQUIVALENT, f"{MPC}.dt=0.2", f"{MPC}.N_p=10"),
+    ),
+    "equivalent, primary, dt 1 s, N_p 5": ("link_loss_nmpc_primary", EQUIVALENT),
+}
 FIGURES: dict[str, tuple[str, dict[str, tuple[str, tuple[str, ...]]], tuple[Any, ...]]] = {
     "figure_12": (
         "Loss of the link, with and without control of the tap changer",
@@ -145,6 +165,13 @@ FURTHER = {
         (f"{MPC}.disturbance_known=true",),
     ),
     "governors, tap changer at work": ("link_loss_governors", ()),
+    "limit, horizon of 278 s, one move": ("link_loss_nmpc_secondary_limit", LONG),
+    "limit, horizon of 278 s, one move, 16 candidates": ("link_loss_nmpc_secondary_limit", (*LONG, CANDIDATES)),
+    "limit, horizon of 278 s, three moves": ("link_loss_nmpc_secondary_limit", (*LONG, MOVES)),
+    "limit, horizon of 278 s, three moves, 16 candidates": (
+        "link_loss_nmpc_secondary_limit",
+        (*LONG, MOVES, CANDIDATES),
+    ),
 }
 
 TRUE = {
@@ -166,7 +193,8 @@ MISMATCHED = {
     "primary of Balsfjord": ("link_loss_nmpc_primary_oltc", ()),
     "secondary": ("link_loss_nmpc_secondary", ()),
     "limit": ("link_loss_nmpc_secondary_limit", ()),
-    "limit, long": ("link_loss_nmpc_secondary_limit", LONG),
+    "limit, horizon of 278 s, one move": ("link_loss_nmpc_secondary_limit", LONG),
+    "limit, horizon of 278 s, three moves": ("link_loss_nmpc_secondary_limit", (*LONG, MOVES)),
 }
 
 
@@ -176,6 +204,11 @@ def draw(out: Path) -> None:
         found = {label: run(config, overrides) for label, (config, overrides) in runs.items()}
         draw_voltages({label: trace for label, (_, trace) in found.items()}, panels, out / f"{name}.png", title)
         print(f"\n{name}\n\n{table({label: row for label, (row, _) in found.items()})}", flush=True)
+
+
+def tables() -> None:
+    """Other backends, other horizons."""
+    print("\nbackends\n\n" + table({label: run(*what)[0] for label, what in BACKENDS.items()}), flush=True)
     print("\nfurther\n\n" + table({label: run(*what)[0] for label, what in FURTHER.items()}), flush=True)
 
 
@@ -193,9 +226,8 @@ def mismatch() -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/regional"))
-    parser.add_argument("--only", choices=("figures", "mismatch"))
+    parser.add_argument("--only", choices=("figures", "tables", "mismatch"))
     arguments = parser.parse_args()
-    if arguments.only != "mismatch":
-        draw(arguments.out)
-    if arguments.only != "figures":
-        mismatch()
+    for part, work in (("figures", lambda: draw(arguments.out)), ("tables", tables), ("mismatch", mismatch)):
+        if arguments.only in (None, part):
+            work()

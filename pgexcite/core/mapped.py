@@ -36,7 +36,7 @@ class Mapped:
         self._library = _compiled(function, compile)
         if self._library is None:
             mapped = function.map(f"{function.name()}_{count}", "serial", count, [1], [])
-            self._call = bind(mapped, [self.points.reshape(-1), self.common], [self.values.reshape(-1)]).trigger
+            self._bound = bind(mapped, [self.points.reshape(-1), self.common], [self.values.reshape(-1)])
         else:
             arrays = (self.points, self.common, self.values)
             self._arguments = (ctypes.c_int(count), *(ctypes.c_void_p(a.ctypes.data) for a in arrays))
@@ -49,14 +49,14 @@ class Mapped:
     def __call__(self) -> Array:
         """Evaluate; the array returned is ``values`` itself."""
         if self._library is None:
-            self._call()
+            self._bound.trigger()
         else:
             self._library.pgexcite_map(*self._arguments)
         return self.values
 
 
 def _compiled(function: ca.Function, choice: Compile) -> ctypes.CDLL | None:
-    if choice == "never" or (choice == "auto" and compiler() is None):
+    if choice == "never" or (choice in ("auto", "wait") and compiler() is None):
         return None
     sizes = {"N_IN": function.numel_in(0), "N_OUT": function.numel_out(0), "FUNCTION": function.name()}
     sizes |= {key.upper(): max(1, getattr(function, key)()) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Rule = Literal["tr_bdf2", "trapezoidal", "backward_euler"]
-Compile = Literal["auto", "never", "always"]
+Compile = Literal["auto", "wait", "never", "always"]
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,9 @@ class Settings:
         t_end: simulated time, s.
         h: step, s.
         rule: integration rule.
-        compile: whether the step is compiled to C: ``"auto"`` where a compiler is found, ``"never"``, or ``"always"``, which
-            fails where there is none.
+        compile: whether the step is compiled to C: ``"auto"`` where a compiler is found and needs a second or so (or has done it
+            before), ``"wait"`` where one is found, however long it takes, ``"never"``, or ``"always"``, which fails where there is
+            none.
         delta_max_deg: a rotor angle beyond this from the reference, degrees, is a loss of synchronism.
         collapse_below: a bus that stays below this voltage, pu, is a voltage collapse; 0 waits until no solution is left.
         collapse_after: how long it must stay below, s.

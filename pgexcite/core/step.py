@@ -140,7 +140,7 @@ class Kernel:
 
     def _compile(self, choice: Compile) -> CompiledLoop | None:
         functions = self.functions
-        if choice == "never" or functions.newton is None or (choice == "auto" and compiler() is None):
+        if choice == "never" or functions.newton is None or (choice in ("auto", "wait") and compiler() is None):
             return None
         source = generate([functions.newton, functions.history, functions.update, functions.outputs], self.constants())
         try:

@@ -53,10 +53,19 @@ def test_without_a_compiler_it_is_slower_never_broken(monkeypatch, cache):
     compiled.run()
     without_compiler(monkeypatch)
     assert compiler() is None
+    assert not simulation("wait").kernel.compiled
     plain = simulation("auto")
     assert not plain.kernel.compiled
     assert plain.run().ending.value == "completed"
     assert np.array_equal(plain.state.x, compiled.state.x)
+
+
+def test_auto_leaves_a_large_model_to_the_virtual_machine_and_wait_does_not(monkeypatch, cache):
+    monkeypatch.setattr("pgexcite.core.step.COMPILED_BY_DEFAULT", 10)
+    assert not simulation("auto").kernel.compiled
+    assert libraries(cache) == []
+    assert simulation("wait").kernel.compiled
+    assert simulation("auto").kernel.compiled  # it is there now
 
 
 def test_without_a_compiler_always_is_an_error_that_says_what_to_do(monkeypatch):
