@@ -128,6 +128,9 @@ def _live(scenario: Scenario, simulation: Simulation) -> Iterator[Callable[[floa
 
         yield lambda _: send()
         send(force=True)
+        if sys.stdin.isatty():
+            # A run is often over before a viewer has connected; someone sits here and says when it is enough.
+            click.pause("the run is over and still served; press any key to end", err=True)
 
 
 def _tail(trace: Trace, start: int) -> Trace:
