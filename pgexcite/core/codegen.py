@@ -92,7 +92,9 @@ def write_functions(functions: Sequence[ca.Function]) -> str:
     bodies = re.findall(r"^static int casadi_f\d+\(.*?^}\n", source, re.DOTALL | re.MULTILINE)
     names = re.findall(r"^int \w+\(const casadi_real\*\* arg.*?^}\n", source, re.DOTALL | re.MULTILINE)
     if helpers is None or len(names) != len(functions) or len(bodies) < len(names):
-        raise CompilationError(f"CasADi {ca.CasadiMeta.version()} lays its C out otherwise than the versions known here")
+        raise CompilationError(
+            f"CasADi {ca.CasadiMeta.version()} lays its C out otherwise than the versions known here"
+        )
     # Names need no prefix once they are static.
     arithmetic = re.sub(r"^#define casadi_\w+ CASADI_PREFIX\(\w+\)\n", "", helpers[0], flags=re.MULTILINE)
     arithmetic = re.sub(r"^(?=casadi_real casadi_)", "static ", arithmetic, flags=re.MULTILINE)
