@@ -109,14 +109,15 @@ class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has
         self._propagate = Mapped(propagate, self._num_sigmas, compile)
         self._sense = Mapped(sense, self._num_sigmas, compile)
 
-    def redraw(self) -> None:
+    def redraw(self, input: float) -> None:
         """Draw the sigma points of the present state, for a measurement that comes before a prediction."""
         self.sigmas_f = self.points_fn.sigma_points(self.x, self.P)
+        self._sense.common[0] = input
 
     def compute_process_sigmas(self, dt: float, fx: Any = None, **given: Any) -> None:
         """All sigma points through the process in one call."""
         np.clip(self.points_fn.sigma_points(self.x, self.P), self._lower, self._upper, out=self._propagate.points)
-        self._propagate.common[0] = given["input"]
+        self._propagate.common[0] = self._sense.common[0] = given["input"]
         self.sigmas_f = self._propagate().copy()
 
     def propagate(self, input: float) -> None:

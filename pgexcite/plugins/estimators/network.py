@@ -23,26 +23,25 @@ Jump = tuple[float, float, float]
 class Network:
     """The network of one unit in one run: ``x_s`` and the voltage ``(b_d, b_q)`` of the equivalent bus, in the filter's state.
 
-    While it is held the filter takes ``x_s`` and ``v_bus`` for known, and their variances are put aside. At rest nothing measured
-    depends on them; left in the filter they would shrink by noise it takes for information, and make it deaf meanwhile.
+    While ``x_s`` is held the filter takes it for known, and its variance is put aside. At rest nothing measured depends on it; left
+    in the filter the variance would shrink by noise that is taken for information, and make the filter deaf meanwhile. The voltage
+    of the bus can be seen at rest where ``x_s`` is given, and goes on being followed.
 
     Args:
         kalman: the filter.
         layout: of its state.
-        noise: standard deviation of measured voltages, pu.
 
     Attributes:
         seen: terminals as last expected, in the order of ``pgexcite.core.equivalent.TERMINALS``.
-        held: whether it is held.
+        held: whether ``x_s`` is held.
     """
 
-    def __init__(self, kalman: MappedFilter, layout: Layout, noise: float) -> None:
-        self._kalman, self._noise = kalman, noise
+    def __init__(self, kalman: MappedFilter, layout: Layout) -> None:
+        self._kalman = kalman
         self._x_s, self._bus, self._all = layout.x_s, layout.bus, slice(layout.x_s, layout.size)
         self.held = False
         self.seen: Array = np.zeros(4)
-        self._aside: Array = np.zeros(2)
-        self._turned = 0.0
+        self._aside, self._turned = 0.0, 0.0
         self._settled, self._settled_P = np.zeros(3), np.zeros((3, 3))
 
     @property
@@ -68,43 +67,35 @@ class Network:
         # At given terminals the voltage of the bus is on a straight line in x_s.
         slope = at.slope * complex(*bus) / at.behind(x_s)
         along = np.array([1.0, slope.real, slope.imag])
-        outwards = np.concatenate(([0.0], directions(bus)[1]))
-        aside = self._aside[0] * np.outer(along, along) + self._aside[1] * np.outer(outwards, outwards)
-        return np.asarray(P + aside)
+        return np.asarray(P + self._aside * np.outer(along, along))
 
     def hold(self, sigma_x_s: float | None = None) -> None:
-        """Take ``x_s`` and ``v_bus`` for known from here on.
+        """Take ``x_s`` for known from here on.
 
         Args:
-            sigma_x_s: standard deviation of ``x_s``, pu, where the filter has none of the network yet.
+            sigma_x_s: its standard deviation, pu, where the filter has none of it yet.
         """
-        kalman = self._kalman
-        fixed = np.zeros((kalman.x.size, 2))
-        fixed[self._x_s, 0] = 1.0
-        fixed[self._bus, 1] = directions(kalman.x[self._bus])[1]
+        P, k = self._kalman.P.copy(), self._x_s
+        self._aside = float(P[k, k]) if sigma_x_s is None else sigma_x_s**2
         if sigma_x_s is None:
-            own = fixed.T @ kalman.P @ fixed
-            given_x_s = own[1, 1] - own[0, 1] ** 2 / own[0, 0]
-            self._aside = np.array([own[0, 0], max(given_x_s, 0.0) + (self._noise / 10) ** 2])
-            kalman.P = kalman.P - kalman.P @ fixed @ np.linalg.solve(own, fixed.T @ kalman.P)
-        else:
-            self._aside = np.array([sigma_x_s**2, self._noise**2])
-        kalman.P = kalman.P + _HELD**2 * fixed @ fixed.T
+            P -= np.outer(P[:, k], P[k, :]) / P[k, k]
+        P[k, :] = P[:, k] = 0.0
+        P[k, k] = _HELD**2
+        self._kalman.P = P
         self.held = True
 
     def release(self) -> None:
-        """Let them go, as uncertain as they were."""
+        """Let it go, as uncertain as it was."""
         if self.held:
             self._kalman.P[self._all, self._all] = self.covariance()
             self.held = False
 
     def keep(self, before: Array, lowest: float, highest: float) -> None:
-        """Give what is held its value in ``before`` again, and ``v_bus`` one within its bounds."""
+        """Give ``x_s`` its value in ``before`` again, where it is held, and ``v_bus`` one within its bounds."""
         x, v_bus = self._kalman.x, self.v_bus
-        wanted = min(max(v_bus, lowest), highest)
         if self.held:
-            x[self._x_s], wanted = before[self._x_s], float(np.hypot(*before[self._bus]))
-        x[self._bus] *= wanted / max(v_bus, 1e-9)
+            x[self._x_s] = before[self._x_s]
+        x[self._bus] *= min(max(v_bus, lowest), highest) / max(v_bus, 1e-9)
 
     # Changing.
 
@@ -139,7 +130,7 @@ class Network:
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
         self.held, self.seen = bool(memory["held"] > 0), memory["seen"]
-        self._aside, self._turned = memory["aside"], float(memory["turned"])
+        self._aside, self._turned = float(memory["aside"]), float(memory["turned"])
         self._settled, self._settled_P = memory["settled"], memory["settled_P"]
 
 

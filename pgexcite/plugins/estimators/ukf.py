@@ -48,9 +48,9 @@ class UKF(BaseModel):
     network may have changed. Two changes are tried, both from the network as it was when it was last settled: a moderate one (a
     line tripped, a fault cleared), then a severe one (a fault). A measurement that neither explains is left out.
 
-    At rest one combination of ``delta``, ``x_s`` and ``v_bus`` cannot be seen from the terminals. Both ``x_s`` and ``v_bus`` are
-    therefore held while nothing moves, and their uncertainty with them. The mirror image of the network, ``x_s < 0``, explains the
-    terminals as well as the true one; sigma points are clipped to ``x_s_min`` and above.
+    At rest one combination of ``delta``, ``x_s`` and ``v_bus`` cannot be seen from the terminals. ``x_s`` is therefore held while
+    nothing moves, and its uncertainty with it; given ``x_s``, ``v_bus`` can be seen and is followed. The mirror image of the
+    network, ``x_s < 0``, explains the terminals as well as the true one; sigma points are clipped to ``x_s_min`` and above.
 
     Measurements that stay unexplained for ``patience``, and a covariance that is none, are a divergence: the estimate is not sound
     until the filter has started anew and explained measurements for ``warm_up``.
@@ -76,13 +76,11 @@ class UKF(BaseModel):
     walk_p_m: float = par(2e-3, "pu/sqrt(s)", "random walk of the mechanical torque", gt=0)
     walk_frequency: float = par(2e-4, "pu/sqrt(s)", "random walk of the equivalent bus's frequency", gt=0)
     walk_x_s: float = par(2e-3, "pu/sqrt(s)", "random walk of x_s while anything moves", gt=0)
-    walk_v_bus: float = par(2e-3, "pu/sqrt(s)", "random walk of v_bus while anything moves", gt=0)
+    walk_v_bus: float = par(5e-4, "pu/sqrt(s)", "random walk of v_bus", gt=0)
     gate: float = par(
         1e-8, "-", "probability with which a measurement that is as expected is taken for unexpected", gt=0
     )
-    hold_after: float = par(
-        2.0, "s", "time after a change of the network at which x_s and v_bus may be held again", ge=0
-    )
+    hold_after: float = par(2.0, "s", "time after a change of the network at which x_s may be held again", ge=0)
     settled_after: float = par(0.5, "s", "time after a change of the network at which it counts as settled", ge=0)
     patience: float = par(0.5, "s", "time for which measurements may stay unexplained", gt=0)
     warm_up: float = par(0.25, "s", "time for which a filter started anew must explain measurements", ge=0)
@@ -136,15 +134,14 @@ class _Tracker:
         self._walk = np.diag(
             self._variances(options.walk_flux, options.walk_omega, options.walk_p_m, options.walk_frequency)
         )
-        self._network = Network(self._kalman, layout, options.noise)
+        self._network = Network(self._kalman, layout)
         at = equivalent.terminals
         self._network.seen = np.array([at.v, at.p, at.q, 1.0])
         self._names = (*layout.rotor, "p_m", "omega_bus", "x_s")
         self._since, self._moving, self._mean = np.inf, 0.0, float(len(TERMINALS))
         self._unexplained, self._anew, self._started = 0.0, 0.0, 0.0
         P = np.diag(self._variances(options.noise, options.noise_omega, options.noise, options.noise_omega / 10))
-        around, _ = directions(self._start[self._bus])
-        P[self._bus, self._bus] = options.noise**2 * np.outer(around, around)
+        P[self._bus, self._bus] = (options.noise / 10) ** 2 * np.eye(2)
         self._kalman.x, self._kalman.P = self._start.copy(), P
         self._network.hold(options.spread * self._network.x_s)
         self._network.settle()
@@ -167,7 +164,7 @@ class _Tracker:
             if self._started:
                 self._propagate(e_fd)
             else:
-                kalman.redraw()
+                kalman.redraw(e_fd)
             self._started = 1.0
             if terminals is not None:
                 expected, surprise, changed = self._judged(terminals)
@@ -187,9 +184,9 @@ class _Tracker:
         around, outwards = directions(before[self._bus])
         walk = self._walk.copy()
         walk[self._bus, self._bus] = options.walk_delta**2 * np.outer(around, around)
+        walk[self._bus, self._bus] += options.walk_v_bus**2 * np.outer(outwards, outwards)
         if not self._network.held:
             walk[self.layout.x_s, self.layout.x_s] = options.walk_x_s**2
-            walk[self._bus, self._bus] += options.walk_v_bus**2 * np.outer(outwards, outwards)
         kalman.Q = walk * self._dt
         kalman.propagate(e_fd)
         self._network.keep(before, options.v_bus_min, options.v_bus_max)
