@@ -48,6 +48,13 @@ BUSES = Quantity("Bus voltages [pu]", (), "RightBottom")
 """Beside them, for an even number of plots: where there are few units the diagram shows the buses well enough."""
 DIAGNOSTICS = {"cost": "cost [-]", "solve_ms": "solve time [ms]"}
 """Controller signals with a plot in the overview, by the end of their name."""
+ESTIMATES = {
+    "x_s": "reactance x_s to the equivalent bus, ± 1 σ [pu]",
+    "v_bus": "voltage V_bus of the equivalent bus, ± 1 σ [pu]",
+}
+"""Controllers' estimates with a plot of their band in the overview; the signal ``sigma_NAME`` has their standard deviation."""
+BANDS = {"above": 1.0, "below": -1.0}
+"""Prefixes of the edges of a band, and their distance from the estimate in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +93,8 @@ class Overview:
         curves = [
             recording.plot(quantity.title, [path for path, _, _ in series], quantity.legend, spans)
             for quantity, series in self._curves()
-        ] + self._diagnostics(spans)
+        ]
+        curves += self._diagnostics(spans) + self._bands(spans)
         shares = [self.single_line.share(), *[1.0 for _ in self.capability.units[:1]]]
         left = rrb.Vertical(self.single_line.view(), *self.capability.views(), row_shares=shares)
         log = recording.text_log("Events", [LOG])
@@ -107,6 +115,11 @@ class Overview:
             slot, _, name = path.rpartition(".")
             if slot.count(".") == 2 or slot.startswith("controller."):
                 recording.style(stream, entity(path), f"{slot.split('.')[1]} {name}", colour(k))
+        for k, path in enumerate(self._estimates()):
+            name = " ".join(path.split(".")[1:])
+            recording.style(stream, entity(path), name, colour(k), 2.0)
+            for side, sigmas in BANDS.items():
+                recording.style(stream, entity(path, side), f"{name} {sigmas:+.0f} σ", _paler(colour(k)), 0.8)
         self.single_line.draw_fixed(stream)
         self.capability.draw_fixed(stream)
 
@@ -119,13 +132,22 @@ class Overview:
         self.capability.send(stream, trace, shown, first)
 
     def _columns(self, trace: Trace) -> dict[str, Array]:
-        """Samples by entity, rotor angles also in degrees."""
+        """Samples by entity, rotor angles also in degrees, and the edges of estimates' bands."""
         columns = {entity(path): samples for path, samples in trace.columns.items()}
         for device in self.units:
             path = f"{device.path}.delta"
             if path in trace.columns:
                 columns[entity(path, DEGREES)] = np.degrees(trace[path])
+        for path in self._estimates():
+            if path in trace.columns:
+                for side, sigmas in BANDS.items():
+                    columns[entity(path, side)] = trace[path] + sigmas * trace[_sigma(path)]
         return columns
+
+    def _estimates(self) -> list[str]:
+        """Signals that are estimates with a standard deviation, the same quantity of all controllers together."""
+        found = [path for path in self.signals if path.startswith("controller.") and _sigma(path) in self.signals]
+        return sorted(path for path in found if path.rpartition(".")[2] in ESTIMATES)
 
     def _curves(self) -> list[tuple[Quantity, list[tuple[str, str, Colour]]]]:
         """The plots with anything in them, each with (entity, name, colour) of its series."""
@@ -154,6 +176,15 @@ class Overview:
             if (paths := [path for path in found if path.endswith(name)])
         ]
 
+    def _bands(self, spans: recording.Spans) -> list[Any]:
+        plots = []
+        for name, title in ESTIMATES.items():
+            paths = [path for path in self._estimates() if path.endswith(f".{name}")]
+            shown = [entity(path, *side) for path in paths for side in ((), *((side,) for side in BANDS))]
+            if shown:
+                plots.append(recording.plot(f"Estimated {title}", shown, spans=spans))
+        return plots
+
     def _component_plots(self, spans: recording.Spans) -> list[Any]:
         """A plot per component of a unit and per controller: states, set-points, everything a person may want to look into."""
         slots: dict[str, list[str]] = {}
@@ -162,6 +193,17 @@ class Overview:
             if (slot.startswith("unit.") and slot.count(".") == 2) or slot.startswith("controller."):
                 slots.setdefault(slot, []).append(entity(path))
         return [recording.plot(" ".join(slot.split(".")[1:]), paths, spans=spans) for slot, paths in slots.items()]
+
+
+def _sigma(path: str) -> str:
+    """Signal of an estimate's standard deviation."""
+    head, _, name = path.rpartition(".")
+    return f"{head}.sigma_{name}"
+
+
+def _paler(rgb: Colour) -> Colour:
+    red, green, blue = (int(0.55 * part) for part in rgb)
+    return red, green, blue
 
 
 def frames(trace: Trace, spacing: float = 0.02) -> np.ndarray[Any, np.dtype[np.int64]]:

@@ -14,7 +14,7 @@ from pgexcite.core.simulate import Simulation
 from pgexcite.core.timing import PHASES, Timing
 from pgexcite.core.trace import Trace
 from pgexcite.plugins.sinks.config import ConfigSink
-from pgexcite.plugins.sinks.overview import frames
+from pgexcite.plugins.sinks.overview import Overview, frames
 from pgexcite.plugins.sinks.parquet import ParquetSink
 from pgexcite.plugins.sinks.rerun import RerunSink, serve
 from pgexcite.plugins.sinks.summary import SummarySink
@@ -78,6 +78,20 @@ def test_rotor_angles_are_shown_in_degrees(synthetic_run, tmp_path):
     result = synthetic_run()
     found = read_back(RerunSink().write(result, tmp_path))
     np.testing.assert_allclose(found["/degrees/unit/G2/delta"][2], np.degrees(result.trace["unit.G2.delta"]))
+
+
+def test_estimates_are_shown_with_their_one_sigma_bands(synthetic_run, tmp_path):
+    result = synthetic_run(mpc=True)
+    n = len(result.trace.t)
+    x_s, sigma = np.linspace(0.3, 0.5, n), np.linspace(0.1, 0.01, n)
+    estimated = {"controller.mpc.x_s": x_s, "controller.mpc.sigma_x_s": sigma, "controller.mpc.v_bus": x_s}
+    trace = replace(result.trace, columns={**result.trace.columns, **estimated})
+    found = read_back(RerunSink().write(replace(result, trace=trace), tmp_path))
+    np.testing.assert_array_equal(found["/above/controller/mpc/x_s"][2], x_s + sigma)
+    np.testing.assert_array_equal(found["/below/controller/mpc/x_s"][2], x_s - sigma)
+    assert "/above/controller/mpc/v_bus" not in found  # nothing says how uncertain it is
+    (plot,) = Overview.of(result.system, trace.columns)._bands({})
+    assert plot.contents == ["/controller/mpc/x_s", "/above/controller/mpc/x_s", "/below/controller/mpc/x_s"]
 
 
 def test_the_blueprint_is_embedded_and_the_log_is_in_it(synthetic_run, tmp_path):
