@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-import casadi as ca
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pgexcite.core.declare import Expr, par
@@ -105,8 +104,3 @@ class Shunt(NetworkElement):
 def complex_product(g: Expr, b: Expr, v: tuple[Expr, Expr]) -> tuple[Expr, Expr]:
     """``(g + jb) (v_re + j v_im)`` as a pair."""
     return g * v[0] - b * v[1], g * v[1] + b * v[0]
-
-
-def is_symbolic(value: object) -> bool:
-    """Whether a value is a CasADi expression."""
-    return isinstance(value, ca.SX)
