@@ -73,7 +73,7 @@ class UKF(BaseModel):
     walk_flux: float = par(5e-3, "pu/sqrt(s)", "random walk of the rotor's fluxes", gt=0)
     walk_omega: float = par(1e-4, "pu/sqrt(s)", "random walk of the speed", gt=0)
     walk_delta: float = par(5e-3, "rad/sqrt(s)", "random walk of the rotor angle", gt=0)
-    walk_p_m: float = par(2e-3, "pu/sqrt(s)", "random walk of the mechanical torque", gt=0)
+    walk_p_m: float = par(5e-3, "pu/sqrt(s)", "random walk of the mechanical torque", gt=0)
     walk_frequency: float = par(2e-4, "pu/sqrt(s)", "random walk of the equivalent bus's frequency", gt=0)
     walk_x_s: float = par(2e-3, "pu/sqrt(s)", "random walk of x_s while anything moves", gt=0)
     walk_v_bus: float = par(5e-4, "pu/sqrt(s)", "random walk of v_bus", gt=0)
