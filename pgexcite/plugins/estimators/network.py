@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import hypot
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,8 @@ class Network:
     @property
     def v_bus(self) -> float:
         """Voltage of the equivalent bus, pu."""
-        return float(np.hypot(*self._kalman.x[self._bus]))
+        b_d, b_q = self._kalman.x[self._bus].tolist()
+        return hypot(b_d, b_q)
 
     # Holding.
 
@@ -95,7 +97,8 @@ class Network:
         x, v_bus = self._kalman.x, self.v_bus
         if self.held:
             x[self._x_s] = before[self._x_s]
-        x[self._bus] *= min(max(v_bus, lowest), highest) / max(v_bus, 1e-9)
+        if not lowest <= v_bus <= highest:
+            x[self._bus] *= min(max(v_bus, lowest), highest) / max(v_bus, 1e-9)
 
     # Changing.
 
@@ -136,14 +139,21 @@ class Network:
 
 def directions(bus: Array) -> tuple[Array, Array]:
     """Where ``(b_d, b_q)`` goes as the rotor angle grows, per rad, and, of length one, as the voltage of the bus does."""
-    return np.array([bus[1], -bus[0]]), bus / max(float(np.hypot(bus[0], bus[1])), 1e-9)
+    b_d, b_q = bus.tolist()
+    return np.array([b_q, -b_d]), bus / max(hypot(b_d, b_q), 1e-9)
+
+
+def wandered(bus: Array, delta: float, v_bus: float) -> Array:
+    """Covariance of ``(b_d, b_q)`` from one of ``delta``, rad, and one of ``v_bus``, pu, given by their deviations."""
+    around, outwards = directions(bus)
+    pair = np.array([delta * around, v_bus * outwards])
+    return np.asarray(pair.T @ pair)
 
 
 def spread(network: Array, jump: Jump) -> Array:
     """Covariance of ``(x_s, b_d, b_q)`` after a change of this kind, shape ``(3, 3)``."""
     delta, x_s, v_bus = jump
-    around, outwards = directions(network[1:])
     P = np.zeros((3, 3))
     P[0, 0] = (x_s * network[0]) ** 2
-    P[1:, 1:] = delta**2 * np.outer(around, around) + v_bus**2 * np.outer(outwards, outwards)
+    P[1:, 1:] = wandered(network[1:], delta, v_bus)
     return P

@@ -17,7 +17,7 @@ from pgexcite.core.equivalent import TERMINALS, Equivalent
 from pgexcite.core.estimation import Estimate, Observer
 from pgexcite.core.settings import Compile
 from pgexcite.plugins.estimators.mapped_filter import Expectation, MappedFilter
-from pgexcite.plugins.estimators.network import Jump, Network, directions, spread
+from pgexcite.plugins.estimators.network import Jump, Network, directions, spread, wandered
 
 Array = NDArray[np.float64]
 
@@ -181,10 +181,8 @@ class _Tracker:
     def _propagate(self, e_fd: float) -> None:
         kalman, options = self._kalman, self.options
         before = kalman.x
-        around, outwards = directions(before[self._bus])
         walk = self._walk.copy()
-        walk[self._bus, self._bus] = options.walk_delta**2 * np.outer(around, around)
-        walk[self._bus, self._bus] += options.walk_v_bus**2 * np.outer(outwards, outwards)
+        walk[self._bus, self._bus] = wandered(before[self._bus], options.walk_delta, options.walk_v_bus)
         if not self._network.held:
             walk[self.layout.x_s, self.layout.x_s] = options.walk_x_s**2
         kalman.Q = walk * self._dt

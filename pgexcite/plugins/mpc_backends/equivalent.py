@@ -46,8 +46,8 @@ class EquivalentMPC(BaseModel):
         default_factory=dict, description="parameters of its own machine that are not the nameplate's, by path"
     )
     iterations: int = par(3, "-", "QPs solved for one plan at the most", ge=1)
-    tolerance: float = par(1e-4, "pu", "largest change of a command at which a plan has converged", gt=0)
-    step: float = par(0.0, "s", "longest prediction step in the first interval; 0 takes the simulation's", ge=0)
+    tolerance: float = par(1e-3, "pu", "largest change of a command at which a plan has converged", gt=0)
+    step: float = par(0.0125, "s", "longest prediction step in the first interval", gt=0)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -83,7 +83,7 @@ class _Equivalent(Shooting):
         self._paths = [f"{unit}.{name}" for name in TERMINALS]
         self._field = f"{unit}.e_fd"
         shooting = ShootingOptions(mode="converged", max_iterations=options.iterations, tolerance=options.tolerance)
-        h = problem.dt / np.ceil(problem.dt / (options.step or surroundings.h) - 1e-9)
+        h = problem.dt / np.ceil(problem.dt / options.step - 1e-9)
         own = _translated(problem, self._equivalent)
         super().__init__(self._equivalent.kernel, own, shooting, rule="tr_bdf2", h=h, grid=surroundings.h)
         self._offset = self._equivalent.offset

@@ -110,7 +110,7 @@ def test_where_the_estimate_is_the_plant_so_is_the_plan(t, changes):
     perfect = NMPC(mode="converged", max_iterations=100, tolerance=1e-9).start(
         posed, given, Plant(sim.model, kernel, sim.p)
     )
-    ours = EquivalentMPC(iterations=100, tolerance=1e-9).start(posed, given, None)
+    ours = EquivalentMPC(iterations=100, tolerance=1e-9, step=H).start(posed, given, None)
     ours._observer = _Knows(sim, ours._equivalent.layout)
     u = np.array([sim.get(COMMAND)])
     expected = perfect.solve(Sample(t, measured(sim), True, sim.state, sim.p), u)
