@@ -302,7 +302,7 @@ TWO_AREAS = {
 @pytest.mark.parametrize("unit", ["G1", "G3"])
 @pytest.mark.parametrize("case", TWO_AREAS)
 def test_in_two_areas_it_stays_in_charge(case, unit):
-    """Four units, two loads, no infinite bus, and after the load step a frequency that falls: an equivalent is found all the same."""
+    """Four units, two loads, no infinite bus, a frequency that falls after the load step: an equivalent is found all the same."""
     system = load(CONFIGS / "two_area" / "thyristor_pss.toml").system
     trace = in_charge_of(unit, system, TWO_AREAS[case], u_min=-4.0, u_max=4.0, t_end=12.0)
     assert trace["controller.mpc.level"].max() == 0
