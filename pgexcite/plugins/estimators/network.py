@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 _HELD = 1e-5
 """Standard deviation of what is held, pu: nothing against any measurement."""
 
+_LOWEST = 0.01
+"""Voltage below which a phasor has no direction worth the name, pu."""
+
 Jump = tuple[float, float, float]
 """Standard deviations of a change of the network: of ``delta``, rad, of ``x_s``, relative, and of ``v_bus``, pu."""
 
@@ -64,10 +67,13 @@ class Network:
         P = kalman.P[self._all, self._all]
         if not self.held:
             return np.array(P)
-        v_t, p_e, q_e, _ = self.seen
-        at, x_s, bus = Terminals(v_t, p_e, q_e), self.x_s, kalman.x[self._bus]
+        v_t, p_e, q_e, _ = self.seen.tolist()
+        at, bus = Terminals(max(v_t, _LOWEST), p_e, q_e), complex(*kalman.x[self._bus])
+        behind = at.behind(self.x_s)
+        if abs(behind) < _LOWEST:
+            return np.array(P)
         # At given terminals the voltage of the bus is on a straight line in x_s.
-        slope = at.slope * complex(*bus) / at.behind(x_s)
+        slope = at.slope * bus / behind
         along = np.array([1.0, slope.real, slope.imag])
         return np.asarray(P + self._aside * np.outer(along, along))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
+from math import sqrt
 from typing import ClassVar
 
 import numpy as np
@@ -260,9 +261,9 @@ class _Tracker:
         v_bus = self._network.v_bus
         told = dict(zip(self._names, x.tolist(), strict=False))
         told |= {f"sigma_{name}": value for name, value in zip(self._names, sigma.tolist(), strict=False)}
-        told["v_bus"], told["sigma_v_bus"] = v_bus, float(np.sqrt(outwards @ P[1:, 1:] @ outwards))
+        told["v_bus"], told["sigma_v_bus"] = v_bus, sqrt(max(float(outwards @ P[1:, 1:] @ outwards), 0.0))
         told["delta"] = float(np.arctan2(*x[self._bus]))
-        told["sigma_delta"] = float(np.sqrt(around @ P[1:, 1:] @ around)) / v_bus**2
+        told["sigma_delta"] = sqrt(max(float(around @ P[1:, 1:] @ around), 0.0)) / v_bus**2
         told["covariance_x_s_v_bus"] = float(P[0, 1:] @ outwards)
         told |= {f"innovation_{name}": value for name, value in zip(TERMINALS, innovation.tolist(), strict=True)}
         told |= {"nis": surprise, "network_change": float(changed), "network_held": float(self._network.held)}
