@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -34,14 +35,14 @@ def boundary(t: float, h: float) -> int:
     return math.ceil(t / h - 1e-6)
 
 
-class _Event(BaseModel):
+class _Event(BaseModel, ABC):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     t: float = Field(ge=0, description="time, s")
 
+    @abstractmethod
     def changes(self) -> tuple[Change, ...]:
         """What happens, as plain changes."""
-        raise NotImplementedError
 
     def problems(self, where: str) -> list[Problem]:
         """What is wrong with this event by itself, each with its path below ``where``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -34,7 +35,7 @@ class Bus(NetworkElement):
     fault_X: float = par(0.0, "pu", "fault reactance", ge=0)
 
 
-class Branch(NetworkElement):
+class Branch(NetworkElement, ABC):
     """A two-terminal element; ``currents`` gives what it draws from each end."""
 
     kind: ClassVar[str] = ""
@@ -53,9 +54,9 @@ class Branch(NetworkElement):
             raise ValueError(f"both ends are at bus {self.from_bus!r}")
         return self
 
-    def admittances(self, p: Mapping[str, Expr]) -> tuple[complex, ...]:
+    @abstractmethod
+    def admittances(self, p: Mapping[str, Expr]) -> tuple[Expr, ...]:
         """Two-port admittances as eight reals ``(g_ff, b_ff, g_ft, b_ft, g_tf, b_tf, g_tt, b_tt)`` from parameters ``p``."""
-        raise NotImplementedError
 
 
 def _series(p: Mapping[str, Expr]) -> tuple[Expr, Expr]:
