@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pgexcite.core.component import Component
+from pgexcite.core.mpc import Problem
 from pgexcite.core.network import Bus, Line, Transformer
 from pgexcite.core.system import Device, Schedule, System
 from pgexcite.plugins.exciters.constant import ConstantField
@@ -76,3 +79,23 @@ def two_units(
         devices=tuple(devices),
         reference=reference,
     )
+
+
+def voltage_problem(command: str, **changes: object) -> Problem:
+    """The paper's problem for unit G2 with three moves, in terms of one command; ``changes`` are its fields."""
+    values: dict[str, object] = {
+        "dt": 0.05,
+        "N_p": 5,
+        "blocks": (1, 1, 1),
+        "commands": (command,),
+        "voltages": ("unit.G2.v_t",),
+        "speeds": ("unit.G2.omega",),
+        "Q": np.array([300.0]),
+        "P": np.array([5.0]),
+        "R": np.array([0.01]),
+        "u_min": np.array([-3.2]),
+        "u_max": np.array([3.2]),
+        "du_max": np.array([np.inf]),
+        "V_ref": np.array([1.0]),
+    }
+    return Problem(**(values | changes))

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import numpy as np
 import pytest
-from plants import kobbelv, regulated, two_units
+from plants import kobbelv, regulated, two_units, voltage_problem
 from pydantic import ValidationError
 
 from pgexcite.core.config import load
@@ -18,7 +18,7 @@ from pgexcite.core.errors import ConfigError
 from pgexcite.core.estimation import Estimate
 from pgexcite.core.events import BranchTrip, Fault, HandOver, LoadStep
 from pgexcite.core.measurement import Measurement
-from pgexcite.core.mpc import Problem, Status
+from pgexcite.core.mpc import Status
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.step import Kernel
@@ -55,25 +55,6 @@ def with_transfer():
     return regulated(transfer=FieldTransfer(V_RMIN=-3.85, V_RMAX=3.85))
 
 
-def problem(**changes):
-    values = {
-        "dt": 0.05,
-        "N_p": 5,
-        "blocks": (1, 1, 1),
-        "commands": (COMMAND,),
-        "voltages": ("unit.G2.v_t",),
-        "speeds": ("unit.G2.omega",),
-        "Q": np.array([300.0]),
-        "P": np.array([5.0]),
-        "R": np.array([0.01]),
-        "u_min": np.array([-3.2]),
-        "u_max": np.array([3.2]),
-        "du_max": np.array([np.inf]),
-        "V_ref": np.array([1.0]),
-    }
-    return Problem(**(values | changes))
-
-
 def surroundings(sim):
     s = sim.initial.state
     u_0 = dict(zip(sim.model.u_names, s.u, strict=True))
@@ -105,7 +86,7 @@ def test_where_the_estimate_is_the_plant_so_is_the_plan(t, changes):
     """The same NMPC on the plant itself, without its network's inner buses: the equations are the same."""
     sim = Simulation(kobbelv(), Settings(2.0, H, "tr_bdf2", "never"), FAULT)
     sim.run(until=t)
-    given, posed = surroundings(sim), problem(**changes)
+    given, posed = surroundings(sim), voltage_problem(COMMAND, **changes)
     kernel = Kernel(sim.model, sim.initial.state, sim.initial.p, "never")
     perfect = NMPC(mode="converged", max_iterations=100, tolerance=1e-9).start(
         posed, given, Plant(sim.model, kernel, sim.p)
@@ -132,7 +113,7 @@ class Forbidden:
 
 def test_it_never_sees_the_plant():
     sim = simulation()
-    solver = EquivalentMPC().start(problem(), surroundings(sim), Forbidden())
+    solver = EquivalentMPC().start(voltage_problem(COMMAND), surroundings(sim), Forbidden())
     found = solver.solve(Sample(0.0, measured(sim), True, Forbidden(), Forbidden()), np.array([sim.get(COMMAND)]))
     assert found.status is Status.CONVERGED
 
@@ -144,7 +125,8 @@ def test_it_does_not_know_the_network():
     line = given.system.lines["L1"]
     other = replace(given.system, lines={"L1": line.model_copy(update={"X": 0.9})}, transformers={})
     solvers = [
-        EquivalentMPC().start(problem(), replace(given, system=system), None) for system in (given.system, other)
+        EquivalentMPC().start(voltage_problem(COMMAND), replace(given, system=system), None)
+        for system in (given.system, other)
     ]
     rng = np.random.default_rng(1)
     for k in range(20):

@@ -6,14 +6,14 @@ from typing import NoReturn
 
 import numpy as np
 import pytest
-from plants import kobbelv, regulated
+from plants import kobbelv, regulated, voltage_problem
 from pydantic import ValidationError
 
 from pgexcite.core.controller import Plant, Sample, Surroundings
 from pgexcite.core.errors import ConfigError
 from pgexcite.core.events import Change, Fault, HandOver
 from pgexcite.core.measurement import Measurement
-from pgexcite.core.mpc import Problem, Status
+from pgexcite.core.mpc import Status
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.step import Kernel
@@ -101,22 +101,7 @@ def test_no_offset_remains_in_secondary_control():
 
 
 def problem_at_rest(sim, **changes):
-    values = {
-        "dt": 0.05,
-        "N_p": 5,
-        "blocks": (1, 1, 1),
-        "commands": (COMMAND,),
-        "voltages": ("unit.G2.v_t",),
-        "speeds": ("unit.G2.omega",),
-        "Q": np.array([300.0]),
-        "P": np.array([5.0]),
-        "R": np.array([0.01]),
-        "u_min": np.array([-3.2]),
-        "u_max": np.array([3.2]),
-        "du_max": np.array([np.inf]),
-        "V_ref": np.array([1.0]),
-    }
-    return Problem(**(values | changes)), surroundings_of(sim)
+    return voltage_problem(COMMAND, **changes), surroundings_of(sim)
 
 
 def surroundings_of(sim):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from plants import kobbelv
+from plants import kobbelv, voltage_problem
 
 from pgexcite.core.controller import Plant, Sample, Surroundings
 from pgexcite.core.errors import ConfigError
 from pgexcite.core.events import Fault
-from pgexcite.core.mpc import Problem, Status
+from pgexcite.core.mpc import Status
 from pgexcite.core.qp import QuadraticProgram
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
@@ -27,22 +27,7 @@ def make(t, rule="tr_bdf2", mismatch=None, **changes):
     sim = Simulation(kobbelv(), Settings(1.0, H, rule, "never"), FAULT.changes())
     sim.run(until=t)
     model = sim.model
-    values = {
-        "dt": 0.05,
-        "N_p": 5,
-        "blocks": (1, 1, 1),
-        "commands": (COMMAND,),
-        "voltages": ("unit.G2.v_t",),
-        "speeds": ("unit.G2.omega",),
-        "Q": np.array([300.0]),
-        "P": np.array([5.0]),
-        "R": np.array([0.01]),
-        "u_min": np.array([-3.2]),
-        "u_max": np.array([3.2]),
-        "du_max": np.array([np.inf]),
-        "V_ref": np.array([1.0]),
-    }
-    problem = Problem(**(values | changes))
+    problem = voltage_problem(COMMAND, **changes)
     surroundings = Surroundings(H, rule, dict(zip(model.u_names, sim.state.u, strict=True)), {}, model.system)
     plant = Plant(model, Kernel(model, sim.initial.state, sim.initial.p, "never"), sim.p)
     options = NMPC(mode="converged", max_iterations=100, tolerance=1e-9, mismatch=mismatch or {})
