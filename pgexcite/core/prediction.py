@@ -2,7 +2,8 @@
 
 Each stage is differentiated by the implicit function theorem with the same written-out factors that solved it:
 ``J dw = -(dr/db db + dr/du du)``. So a prediction is what the simulation will do, to the last bit, and its derivatives are
-those of the discrete-time plant.
+those of the discrete-time plant. A step that the fixed order of elimination cannot take ends a prediction, in C and in the virtual
+machine alike: there are no derivatives through the shorter steps or the pivoting by which a simulation would go on.
 """
 
 from __future__ import annotations
@@ -309,7 +310,7 @@ class Predictor:
         """One step; the startup steps left, ``None`` where it cannot be taken."""
         kernel = self._kernel
         self._x[:], self._z[:] = kernel.x, kernel.z
-        if not kernel.take(self._rule, h, startup):
+        if not kernel.take(self._rule, h, startup, pivoting=False):
             return None
         if sense:
             self._sense_step(euler=self._rule == "trapezoidal" and startup > 0)
