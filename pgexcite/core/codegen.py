@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -61,9 +62,33 @@ def generate(functions: Sequence[ca.Function], constants: Mapping[str, object], 
     """
     sizes = {key: max(1, *(getattr(f, key)() for f in functions)) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}
     values = {"pgexcite_public": "", **constants, **sizes}
-    defines = "".join(f"#define {name.upper()} {value}\n" for name, value in values.items())
     loops = [loop("step.c"), loop("rollout.c")] if rollout else [loop("step.c")]
-    return "\n".join([write_functions(functions), defines, *loops])
+    return "\n".join([write_functions(functions), define(values), *loops])
+
+
+def define(constants: Mapping[str, object]) -> str:
+    """Macros of these names, in capitals; numbers to the last bit, text as it is."""
+    return "".join(
+        f"#define {name.upper()} {value if isinstance(value, str) else number(value)}\n"
+        for name, value in constants.items()
+    )
+
+
+def array(name: str, values: NDArray[np.float64] | NDArray[np.int32]) -> str:
+    """A constant array; C has none without elements."""
+    kind = "int" if np.issubdtype(values.dtype, np.integer) else "double"
+    items = [number(value) for value in values.tolist()] or ["0"]
+    return f"static const {kind} {name}[{len(items)}] = {{{', '.join(items)}}};"
+
+
+def number(value: Any) -> str:
+    """A number to the last bit."""
+    if isinstance(value, int):
+        return str(int(value))
+    value = float(value)
+    if np.isfinite(value):
+        return repr(value)
+    return "INFINITY" if value > 0 else "-INFINITY"
 
 
 def loop(name: str) -> str:

@@ -1,11 +1,12 @@
-"""Estimators: what they are told of a unit's terminals, what they answer, and how they are configured."""
+"""Estimators: what they are told of a unit's terminals, what they answer, how they are configured, and how they look in C."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,4 +62,38 @@ class Estimator(Protocol):
 
     def start(self, equivalent: Equivalent, dt: float, compile: Compile) -> Observer:
         """Begin a run with this sample time, s."""
+        ...
+
+
+@dataclass(frozen=True)
+class Written:
+    """An observer as C, for an exported controller. ``text`` goes below the functions, constants, arrays, ``step.c``, ``dense.c``.
+
+    It offers, for terminals as ``Observer.observe`` is told them (null where lost)::
+
+        static double estimator_value[], estimator_told[];
+        static void estimator_reset(void);
+        static int estimator_observe(const double *terminals, double e_fd); /* is the estimate sound */
+
+    Attributes:
+        functions: CasADi functions it calls by their names.
+        constants: macros it expects.
+        arrays: constant arrays it expects.
+        text: C99 that allocates nothing and names nothing that has external linkage.
+        told: names of the numbers in ``estimator_told``.
+    """
+
+    functions: tuple[ca.Function, ...]
+    constants: Mapping[str, object]
+    arrays: Mapping[str, Array]
+    text: str
+    told: tuple[str, ...]
+
+
+@runtime_checkable
+class Writable(Protocol):
+    """An observer that can be written as C."""
+
+    def written(self) -> Written:
+        """It as it is before its first sample."""
         ...

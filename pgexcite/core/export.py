@@ -16,7 +16,7 @@ from string import Template
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.codegen import generate, loop
+from pgexcite.core.codegen import array, generate, loop
 from pgexcite.core.config import Scenario
 from pgexcite.core.controller import Sample
 from pgexcite.core.errors import ConfigError, PgexciteError, Problem
@@ -177,7 +177,13 @@ def _files(name: str, scenario: Scenario, session: Ladder, shooting: Shooting) -
     def filled(template: str) -> str:
         return Template(loop(template)).substitute(words)
 
-    source = [f'#include "{name}.h"\n', _generated(shooting, session), loop("qp.c"), filled("controller.c")]
+    source = [
+        f'#include "{name}.h"\n',
+        _generated(shooting, session),
+        loop("dense.c"),
+        loop("qp.c"),
+        filled("controller.c"),
+    ]
     return {
         f"{name}.h": filled("controller.h"),
         f"{name}.c": "\n".join(source),
@@ -248,20 +254,7 @@ def _generated(shooting: Shooting, session: Ladder) -> str:
     }
     loops = [functions.newton, functions.history, functions.update, functions.outputs, *sensitivities]
     text = generate(loops, kernel.constants() | constants, rollout=True)
-    return "\n".join([text, *(_array(name, values) for name, values in arrays.items())]) + "\n"
-
-
-def _array(name: str, values: NDArray[np.float64] | NDArray[np.int32]) -> str:
-    """A constant array; C has none without elements."""
-    kind = "int" if np.issubdtype(values.dtype, np.integer) else "double"
-    items = [_number(value) for value in values.tolist()] or ["0"]
-    return f"static const {kind} {name}[{len(items)}] = {{{', '.join(items)}}};"
-
-
-def _number(value: float) -> str:
-    if isinstance(value, int) or np.isfinite(value):
-        return repr(value)
-    return "INFINITY" if value > 0 else "-INFINITY"
+    return "\n".join([text, *(array(name, values) for name, values in arrays.items())]) + "\n"
 
 
 def _listed(names: Sequence[str]) -> str:

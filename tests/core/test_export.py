@@ -191,7 +191,9 @@ int solve_qp(const double *H, const double *g, const double *l, const double *u,
 
 def qp_library(folder, n, m, rate):
     name = f"qp_{n}_{m}_{rate}"
-    (folder / f"{name}.c").write_text(QP.format(n=n, m=m, rate=rate, text=codegen.loop("qp.c")))
+    (folder / f"{name}.c").write_text(
+        QP.format(n=n, m=m, rate=rate, text=codegen.loop("dense.c") + codegen.loop("qp.c"))
+    )
     command = [compiler(), "-O1", "-fPIC", "-shared", f"{name}.c", "-o", f"{name}.so", "-lm"]
     subprocess.run(command, cwd=folder, check=True)
     return ctypes.CDLL(str(folder / f"{name}.so")).solve_qp

@@ -4,7 +4,7 @@
 
        min x'Hx/2 + g'x    lower <= x <= upper    row_lower <= x_i - x_{i - N_COMMANDS} <= row_upper (if RATE)
 
-   Expects N_V variables, N_COMMANDS and RATE. */
+   Goes below dense.c. Expects N_V variables, N_COMMANDS and RATE. */
 
 #include <math.h>
 #include <string.h>
@@ -15,40 +15,6 @@
 
 static double qp_L[N_V * N_V], qp_W[(N_V + 1) * N_V], qp_gram[N_V * N_V], qp_multiplier[N_V + 1], qp_r[N_V + 1];
 static int qp_active[N_V + 1], qp_q;
-
-/* Cholesky factor of a symmetric matrix of order n (row length n), in place; 0 where it is not positive definite. */
-static int qp_cholesky(double *A, int n) {
-    int i, j, k;
-    for (j = 0; j < n; j++) {
-        for (i = j; i < n; i++) {
-            double sum = A[i * n + j];
-            for (k = 0; k < j; k++) sum -= A[i * n + k] * A[j * n + k];
-            if (i == j) {
-                if (!(sum > 0)) return 0;
-                A[j * n + j] = sqrt(sum);
-            } else {
-                A[i * n + j] = sum / A[j * n + j];
-            }
-        }
-    }
-    return 1;
-}
-
-static void qp_forward(const double *L, int n, double *x) {
-    int i, k;
-    for (i = 0; i < n; i++) {
-        for (k = 0; k < i; k++) x[i] -= L[i * n + k] * x[k];
-        x[i] /= L[i * n + i];
-    }
-}
-
-static void qp_backward(const double *L, int n, double *x) {
-    int i, k;
-    for (i = n - 1; i >= 0; i--) {
-        for (k = i + 1; k < n; k++) x[i] -= L[k * n + i] * x[k];
-        x[i] /= L[i * n + i];
-    }
-}
 
 /* Constraints are n'x >= b, numbered: lower bounds, upper bounds, lower rows, upper rows. */
 static void qp_normal(int c, double *n) {
@@ -84,9 +50,9 @@ static int qp_solve_gram(double *r) {
             for (i = 0; i < N_V; i++) sum += qp_W[a * N_V + i] * qp_W[b * N_V + i];
             qp_gram[a * qp_q + b] = sum;
         }
-    if (!qp_cholesky(qp_gram, qp_q)) return 0;
-    qp_forward(qp_gram, qp_q, r);
-    qp_backward(qp_gram, qp_q, r);
+    if (!cholesky(qp_gram, qp_q)) return 0;
+    forward(qp_gram, qp_q, r);
+    backward(qp_gram, qp_q, r);
     return 1;
 }
 
@@ -106,10 +72,10 @@ static int qp_solve(const double *H, const double *g, const double *lower, const
     static double free_x[N_V], v[N_V], z[N_V], n[N_V];
     int i, k, c, iteration;
     memcpy(qp_L, H, sizeof qp_L);
-    if (!qp_cholesky(qp_L, N_V)) return 0;
+    if (!cholesky(qp_L, N_V)) return 0;
     for (i = 0; i < N_V; i++) x[i] = -g[i];
-    qp_forward(qp_L, N_V, x);
-    qp_backward(qp_L, N_V, x);
+    forward(qp_L, N_V, x);
+    backward(qp_L, N_V, x);
     memcpy(free_x, x, sizeof free_x);
     qp_q = 0;
     for (iteration = 0; iteration < QP_MAX_ITERATIONS; iteration++) {
@@ -126,7 +92,7 @@ static int qp_solve(const double *H, const double *g, const double *lower, const
         gap = worst;
         qp_normal(chosen, n);
         memcpy(v, n, sizeof v);
-        qp_forward(qp_L, N_V, v);
+        forward(qp_L, N_V, v);
         for (;;) {
             double vv = 0, zz = 0, partial = INFINITY, full, t;
             int leaving = -1;
@@ -151,7 +117,7 @@ static int qp_solve(const double *H, const double *g, const double *lower, const
             t = full < partial ? full : partial;
             if (!(t < INFINITY)) return 0;
             if (full < INFINITY) {
-                qp_backward(qp_L, N_V, z);
+                backward(qp_L, N_V, z);
                 for (i = 0; i < N_V; i++) x[i] += t * z[i];
                 gap += t * zz;
             }
@@ -174,7 +140,7 @@ static int qp_solve(const double *H, const double *g, const double *lower, const
         x[i] = 0;
         for (k = 0; k < qp_q; k++) x[i] += qp_r[k] * qp_W[k * N_V + i];
     }
-    qp_backward(qp_L, N_V, x);
+    backward(qp_L, N_V, x);
     for (i = 0; i < N_V; i++) {
         x[i] += free_x[i];
         if (x[i] < lower[i]) x[i] = lower[i];

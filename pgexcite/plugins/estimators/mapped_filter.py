@@ -30,7 +30,7 @@ class SigmaPoints(MerweScaledSigmaPoints):  # type: ignore[misc]  # filterpy has
 
     def __init__(self, n: int) -> None:
         super().__init__(n, 1.0, 2.0, max(3.0, n / 3.0) - n, sqrt_method=_upper_factor)
-        self._scale = max(3.0, n / 3.0)
+        self.scale = max(3.0, n / 3.0)
 
     def sigma_points(self, x: Array, P: Array) -> Array:
         """Points around ``x``, shape ``(2n + 1, n)``.
@@ -38,7 +38,7 @@ class SigmaPoints(MerweScaledSigmaPoints):  # type: ignore[misc]  # filterpy has
         Raises:
             numpy.linalg.LinAlgError: ``P`` is not positive definite.
         """
-        root: Array = self.sqrt(self._scale * P)
+        root: Array = self.sqrt(self.scale * P)
         return np.vstack((x, x + root, x - root))
 
 
@@ -105,7 +105,7 @@ class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has
     ) -> None:
         n, n_z = lower.size, sense.numel_out(0)
         super().__init__(n, n_z, dt, hx=None, fx=None, points=SigmaPoints(n))
-        self._lower, self._upper, self._share = lower, upper, share
+        self.lower, self.upper, self.share = lower, upper, share
         self._propagate = Mapped(propagate, self._num_sigmas, compile)
         self._sense = Mapped(sense, self._num_sigmas, compile)
 
@@ -116,7 +116,7 @@ class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has
 
     def compute_process_sigmas(self, dt: float, fx: Any = None, **given: Any) -> None:
         """All sigma points through the process in one call."""
-        np.clip(self.points_fn.sigma_points(self.x, self.P), self._lower, self._upper, out=self._propagate.points)
+        np.clip(self.points_fn.sigma_points(self.x, self.P), self.lower, self.upper, out=self._propagate.points)
         self._propagate.common[0] = self._sense.common[0] = given["input"]
         self.sigmas_f = self._propagate().copy()
 
@@ -129,14 +129,14 @@ class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has
     ) -> tuple[Array, Array]:
         x = Wm @ sigmas
         error = sigmas - x
-        P = error.T @ (Wc[:, None] * error) + Q + np.diag((self._share * (x - self.x)) ** 2)
+        P = error.T @ (Wc[:, None] * error) + Q + np.diag((self.share * (x - self.x)) ** 2)
         return x, _symmetric(P)
 
     def expect(self, x: Array | None = None, P: Array | None = None) -> Expectation:
         """What would be measured at the filter's own state, or at another."""
         points = self._sense.points
         sigmas = self.sigmas_f if x is None else self.points_fn.sigma_points(x, P)
-        np.clip(sigmas, self._lower, self._upper, out=points)
+        np.clip(sigmas, self.lower, self.upper, out=points)
         seen = self._sense()
         x, z = self.Wm @ points, self.Wm @ seen
         dx, dz = points - x, seen - z
@@ -148,7 +148,7 @@ class MappedFilter(UnscentedKalmanFilter):  # type: ignore[misc]  # filterpy has
     def correct(self, expected: Expectation, z: Array) -> None:
         """Correct by a measurement."""
         K = expected.gain
-        self.x = np.clip(expected.x + K @ (z - expected.z), self._lower, self._upper)
+        self.x = np.clip(expected.x + K @ (z - expected.z), self.lower, self.upper)
         self.P = _symmetric(expected.P - K @ expected.C.T)
 
     def update(self, z: Array, R: Any = None, UT: Any = None, hx: Any = None, **given: Any) -> None:

@@ -14,10 +14,10 @@ from pgexcite.plugins.estimators.mapped_filter import MappedFilter
 
 Array = NDArray[np.float64]
 
-_HELD = 1e-5
+HELD = 1e-5
 """Standard deviation of what is held, pu: nothing against any measurement."""
 
-_LOWEST = 0.01
+LOWEST = 0.01
 """Voltage below which a phasor has no direction worth the name, pu."""
 
 Jump = tuple[float, float, float]
@@ -68,9 +68,9 @@ class Network:
         if not self.held:
             return np.array(P)
         v_t, p_e, q_e, _ = self.seen.tolist()
-        at, bus = Terminals(max(v_t, _LOWEST), p_e, q_e), complex(*kalman.x[self._bus])
+        at, bus = Terminals(max(v_t, LOWEST), p_e, q_e), complex(*kalman.x[self._bus])
         behind = at.behind(self.x_s)
-        if abs(behind) < _LOWEST:
+        if abs(behind) < LOWEST:
             return np.array(P)
         # At given terminals the voltage of the bus is on a straight line in x_s.
         slope = at.slope * bus / behind
@@ -88,7 +88,7 @@ class Network:
         if sigma_x_s is None:
             P -= np.outer(P[:, k], P[k, :]) / P[k, k]
         P[k, :] = P[:, k] = 0.0
-        P[k, k] = _HELD**2
+        P[k, k] = HELD**2
         self._kalman.P = P
         self.held = True
 

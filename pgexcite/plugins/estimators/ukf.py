@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 from math import sqrt
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -15,10 +16,10 @@ from scipy.stats import chi2
 from pgexcite.core.controller import as_arrays
 from pgexcite.core.declare import par
 from pgexcite.core.equivalent import TERMINALS, Equivalent
-from pgexcite.core.estimation import Estimate, Observer
+from pgexcite.core.estimation import Estimate, Observer, Written
 from pgexcite.core.settings import Compile
 from pgexcite.plugins.estimators.mapped_filter import Expectation, MappedFilter
-from pgexcite.plugins.estimators.network import Jump, Network, directions, spread, wandered
+from pgexcite.plugins.estimators.network import HELD, LOWEST, Jump, Network, directions, spread, wandered
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,21 @@ _MODERATE: Jump = (0.1, 0.5, 0.05)
 """A line trips, a fault is cleared."""
 _SEVERE: Jump = (1.0, 0.1, 0.6)
 """A fault."""
+_JUMPS = (_MODERATE, _SEVERE)
+"""In the order in which they are tried."""
+
+_TOLD = (
+    "x_s",
+    "sigma_x_s",
+    "v_bus",
+    "sigma_v_bus",
+    "delta",
+    "sigma_delta",
+    "nis",
+    "network_change",
+    "network_held",
+)
+"""What an exported filter tells, in the order of ``ukf.c``."""
 
 
 class UKF(BaseModel):
@@ -128,7 +144,8 @@ class _Tracker:
         share = np.zeros(layout.size)
         share[: len(layout.rotor)] = options.share
         steps = int(np.ceil(dt / _LONGEST_STEP - 1e-9))
-        self._kalman = MappedFilter(*equivalent.functions(dt, steps), lower, upper, share, dt, compile)
+        self._functions = equivalent.functions(dt, steps)
+        self._kalman = MappedFilter(*self._functions, lower, upper, share, dt, compile)
         self._kalman.R = np.diag(
             np.square([options.noise_omega if name == "omega" else options.noise for name in TERMINALS])
         )
@@ -213,11 +230,9 @@ class _Tracker:
             return expected, surprise, 0
         self._unexplained += self._dt
         self._anew = options.warm_up if self._anew > 0 else 0.0
-        for k, jump in enumerate((_MODERATE, _SEVERE)):
+        for k, jump in enumerate(_JUMPS):
             x, P = self._network.changed(jump)
-            P[: self._fluxes.size, : self._fluxes.size] += np.diag(
-                np.where(self._fluxes, options.noise**2, 4 * options.noise_omega**2)
-            )
+            P[: self._fluxes.size, : self._fluxes.size] += np.diag(self._jolt())
             other = self._kalman.expect(x, P)
             left = other.surprise(z)
             if left <= options.limit:
@@ -225,6 +240,11 @@ class _Tracker:
                 self._since, self._moving, self._mean = 0.0, options.hold_after, float(len(TERMINALS))
                 return other, left, k + 1
         return expected, surprise, -1
+
+    def _jolt(self) -> Array:
+        """What a change of the network does to the variances of the rotor's states, beyond what the model says."""
+        options = self.options
+        return np.where(self._fluxes, options.noise**2, 4 * options.noise_omega**2)
 
     def _correct(self, expected: Expectation, z: Array) -> None:
         kalman, network, options = self._kalman, self._network, self.options
@@ -241,14 +261,19 @@ class _Tracker:
 
     def _restart(self) -> None:
         """Start anew from the initial point, of which next to nothing is taken for certain."""
+        options = self.options
+        self._kalman.x, self._kalman.P, self._network.held = self._start.copy(), self._uncertain(), False
+        self._network.settle()
+        self._since, self._moving, self._mean = np.inf, options.hold_after, float(len(TERMINALS))
+        self._unexplained, self._anew = 0.0, options.warm_up
+
+    def _uncertain(self) -> Array:
+        """Covariance of the initial point where next to nothing of it is certain."""
         options, layout = self.options, self.layout
         P = np.diag(self._variances(0.2, 10 * options.noise_omega, 0.1, options.noise_omega))
         delta, _, v_bus = _SEVERE
         P[layout.x_s :, layout.x_s :] = spread(self._start[layout.x_s :], (delta, options.spread, v_bus))
-        self._kalman.x, self._kalman.P, self._network.held = self._start.copy(), P, False
-        self._network.settle()
-        self._since, self._moving, self._mean = np.inf, options.hold_after, float(len(TERMINALS))
-        self._unexplained, self._anew = 0.0, options.warm_up
+        return P
 
     # What is told of it.
 
@@ -285,3 +310,56 @@ class _Tracker:
             setattr(self, f"_{name}", float(memory[name]))
         start = "network:"
         self._network.recall({k.removeprefix(start): v for k, v in memory.items() if k.startswith(start)})
+
+    # As C.
+
+    def written(self) -> Written:
+        """See ``pgexcite.core.estimation.Writable``; the text is ``ukf.c``."""
+        options, layout, kalman, first = self.options, self.layout, self._kalman, self.memory()
+        constants = {
+            "n": layout.size,
+            "m": len(TERMINALS),
+            "rotor": len(layout.rotor),
+            "omega": layout.omega,
+            "dt": self._dt,
+            "omega_0": self._omega_0,
+            "scale": kalman.points_fn.scale,
+            "weight": kalman.Wm[1],
+            "weight_0": kalman.Wm[0],
+            "weight_0_P": kalman.Wc[0],
+            "limit": options.limit,
+            "limit_calm": options.limit_calm,
+            "limit_mean": options.limit_mean,
+            "forget": _FORGET,
+            "forgive": _FORGIVE,
+            "swing": _SWING * options.noise_omega,
+            "held": HELD,
+            "lowest": LOWEST,
+            "start_aside": float(first["network:aside"]),
+            "told": len(_TOLD),
+            "n_jumps": len(_JUMPS),
+        }
+        bounds, walks = ("v_bus_min", "v_bus_max"), ("walk_delta", "walk_v_bus", "walk_x_s")
+        clocks = ("hold_after", "settled_after", "patience", "warm_up")
+        constants |= {name: getattr(options, name) for name in (*bounds, *walks, *clocks)}
+        arrays = {
+            "lower": kalman.lower,
+            "upper": kalman.upper,
+            "share": kalman.share,
+            "R": kalman.R.diagonal(),
+            "walk": self._walk.diagonal(),
+            "jolt": self._jolt(),
+            "jumps": np.array(_JUMPS),
+            "restart_P": self._uncertain(),
+            "start": self._start,
+            "start_P": first["P"],
+            "start_seen": first["network:seen"],
+            "start_settled_P": first["network:settled_P"],
+        }
+        return Written(
+            self._functions,
+            {f"ukf_{name}": value for name, value in constants.items()},
+            {f"UKF_{name.upper()}": np.array(values, dtype=float).ravel() for name, values in arrays.items()},
+            Path(__file__).with_name("ukf.c").read_text(encoding="utf-8"),
+            _TOLD,
+        )
