@@ -41,6 +41,10 @@ class KundurFlux(Machine):
     - ``"incremental"``: total at the initial point, and from there along the tangent of the air-gap characteristic,
       ``K_s(incr) = 1 / (1 + B_sat psi_I)``, frozen (section 12.3.2). Right for small deviations only.
 
+    With ``speed_voltage`` the fluxes induce ``omega psi`` in the stator, while the network's reactances stay those of nominal
+    frequency: what RAMSES computes (STEPSS documentation, "Synchronous Machine Model"). Without it, as in Kundur's examples, torque
+    and air-gap power are equal in pu at any speed. On his two-area system it moves the modes by up to 0.07 1/s.
+
     An amortisseur that is switched off stays as an algebraic zero. Defaults: example 12.3 (field circuit alone), and the
     amortisseurs of example 3.2's 555 MVA machine.
 
@@ -69,6 +73,7 @@ class KundurFlux(Machine):
     L_2q: float = par(0.125, "pu", "leakage inductance of 2q", gt=0)
     R_2q: float = par(0.02368, "pu", "resistance of 2q", gt=0)
     saturation: Literal["none", "total", "incremental"] = par("none", "-", "how the air-gap characteristic is followed")
+    speed_voltage: bool = par(False, "-", "whether the voltages that fluxes induce in the stator grow with speed")
     A_sat: float = par(0.031, "pu", "flux lost to saturation at psi_T1", ge=0)
     B_sat: float = par(6.93, "-", "exponent of saturation, per pu of flux", ge=0)
     psi_T1: float = par(0.8, "pu", "air-gap flux where saturation sets in", ge=0)
@@ -93,7 +98,8 @@ class KundurFlux(Machine):
         ]
         d = self._axis(v, self.L_adu, v.psi_ad0, rotor_d)
         q = self._axis(v, self.L_aqu, v.psi_aq0, rotor_q)
-        s = stator(v, e_d=-q.source, e_q=d.source, R_a=self.R_a, X_d=d.L + self.L_l, X_q=q.L + self.L_l)
+        speed = v.omega if self.speed_voltage else 1.0
+        s = stator(v, e_d=-q.source, e_q=d.source, R_a=self.R_a, X_d=d.L + self.L_l, X_q=q.L + self.L_l, speed=speed)
         psi_ad, psi_aq = d.flux(s.i_d), q.flux(s.i_q)
         i_fd = (v.psi_fd - psi_ad) / self.L_fd
         e_fd = self.R_fd / self.L_adu * v.e_fd

@@ -1,8 +1,8 @@
 """What the machine models share: the dq frame, the stator's algebraic equations, the swing equation and the outputs.
 
 Convention (Kundur, section 5.1): generator currents; the q-axis leads the real axis of the network's frame by ``delta`` and the
-d-axis lags the q-axis by 90 degrees, so ``v_d + j v_q = (v_re + j v_im) exp(j (pi/2 - delta))``. Stator transients and the effect
-of speed on the stator voltages are neglected, as in every phasor-domain stability program.
+d-axis lags the q-axis by 90 degrees, so ``v_d + j v_q = (v_re + j v_im) exp(j (pi/2 - delta))``. Stator transients are neglected,
+as in every phasor-domain stability program; so is the effect of speed on the stator voltages, unless a machine asks for it.
 """
 
 from __future__ import annotations
@@ -37,14 +37,16 @@ class Stator:
     current: tuple[Expr, Expr]
 
 
-def stator(v: Signals, *, e_d: Expr, e_q: Expr, R_a: Expr, X_d: Expr, X_q: Expr) -> Stator:
-    """Solve ``v_d = e_d + X_q i_q - R_a i_d``, ``v_q = e_q - X_d i_d - R_a i_q`` for the current.
+def stator(v: Signals, *, e_d: Expr, e_q: Expr, R_a: Expr, X_d: Expr, X_q: Expr, speed: Expr = 1.0) -> Stator:
+    """Solve ``v_d = w (e_d + X_q i_q) - R_a i_d``, ``v_q = w (e_q - X_d i_d) - R_a i_q`` for the current.
 
     Args:
         v: signals of the machine: ``delta``, ``v_re``, ``v_im``.
         e_d, e_q: voltage behind the reactances, pu.
-        R_a, X_d, X_q: armature resistance and the reactances that belong to ``e_d``, ``e_q``, pu.
+        R_a, X_d, X_q: armature resistance and the reactances that belong to ``e_d``, ``e_q``, pu at nominal speed.
+        speed: ``w``, at which the fluxes turn, pu; 1 neglects the effect of speed on the stator voltage.
     """
+    e_d, e_q, X_d, X_q = speed * e_d, speed * e_q, speed * X_d, speed * X_q
     sine, cosine = ca.sin(v.delta), ca.cos(v.delta)
     v_d = v.v_re * sine - v.v_im * cosine
     v_q = v.v_re * cosine + v.v_im * sine

