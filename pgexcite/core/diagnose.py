@@ -47,7 +47,7 @@ def active_devices(model: Model, d: Array) -> tuple[str, ...]:
                 found.append(f"{path} acts")
             position = _discrete(model, d, f"{path}.position") if component.role == "tap_changer" else 0.0
             if position:
-                found.append(f"{path} at {position:+.0f}")
+                found.append(f"{path} at position {position:+.0f}")
     return tuple(found)
 
 
@@ -73,9 +73,19 @@ def _discrete(model: Model, d: Array, path: str) -> float:
 
 def collapse(model: Model, state: State, bus: str, text: str) -> Outcome:
     """A voltage collapse at ``bus``, with what was active then."""
+    return _with_active(model, state, Ending.VOLTAGE_COLLAPSE, f"bus.{bus}", f"voltage collapse at bus {bus} {text}")
+
+
+def lost_synchronism(model: Model, state: State, unit: str, text: str) -> Outcome:
+    """A loss of synchronism of ``unit`` (a path), with what was active then."""
+    at = f"{unit} lost synchronism at t = {state.t:.4f} s: {text}"
+    return _with_active(model, state, Ending.LOST_SYNCHRONISM, unit, at)
+
+
+def _with_active(model: Model, state: State, ending: Ending, where: str, text: str) -> Outcome:
     active = active_devices(model, state.d)
     told = f"{text}; active: {', '.join(active)}" if active else text
-    return Outcome(Ending.VOLTAGE_COLLAPSE, state.t, f"bus.{bus}", told, active)
+    return Outcome(ending, state.t, where, told, active)
 
 
 def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healthy: float) -> Outcome:
@@ -100,9 +110,7 @@ def diagnose(kernel: Kernel, state: State, p: Array, rule: Rule, h: float, healt
     singular = np.linalg.svd(jacobian)
     if settled is None or singular.S[-1] < _NEARLY_SINGULAR * healthy:
         bus = _weakest_bus(kernel.model, singular.Vh[-1])
-        text = (
-            f"voltage collapse at bus {bus}: from t = {state.t:.4f} s on no voltage satisfies the network and its loads"
-        )
+        text = f"at t = {state.t:.4f} s: from then on no voltage satisfies the network and its loads"
         return collapse(kernel.model, state, bus, text)
     text = f"the step after t = {state.t:.4f} s has no solution; the equation furthest from being satisfied is that of {worst}"
     return Outcome(Ending.DIVERGED, state.t, worst, text)

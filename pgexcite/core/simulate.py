@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.controller import Controller, Plant, Sample, Session, Surroundings
-from pgexcite.core.diagnose import collapse, diagnose, limiters_at_work, smallest_singular_value
+from pgexcite.core.diagnose import (
+    collapse,
+    diagnose,
+    limiters_at_work,
+    lost_synchronism,
+    smallest_singular_value,
+)
 from pgexcite.core.errors import ConfigError, Problem, SnapshotError
 from pgexcite.core.events import Change, boundary
 from pgexcite.core.initialise import Initial, initialise
@@ -241,11 +247,11 @@ class Simulation:
             self.state = State(before.k + keep, float(t[row]), segment.x[row], segment.z[row], segment.d[row], before.u)
         if lost is not None and lost[0] == keep - 1:
             _, unit, angle = lost
-            text = f"{unit} lost synchronism at t = {self.state.t:.4f} s: its rotor angle reached {angle:.1f} degrees"
-            self._end(Outcome(Ending.LOST_SYNCHRONISM, self.state.t, unit, text))
+            text = f"its rotor angle against {self._angles.reference(unit)} reached {angle:.1f} degrees"
+            self._end(lost_synchronism(self.model, self.state, unit, text))
         elif low is not None:
             _, bus, voltage = low
-            text = f"voltage collapse at bus {bus} at t = {self.state.t:.4f} s: {voltage:.3f} pu"
+            text = f"at t = {self.state.t:.4f} s: {voltage:.3f} pu"
             text += f", below {self.settings.collapse_below:g} pu for {self.settings.collapse_after:g} s"
             self._end(collapse(self.model, self.state, bus, text))
         elif segment.failed:

@@ -66,6 +66,11 @@ class RotorAngles:
         unit = int(np.argmax(np.abs(angles[row])))
         return row, self.names[unit], float(np.degrees(angles[row, unit]))
 
+    def reference(self, unit: str) -> str:
+        """What the angle of a unit (a path) is measured against, in words."""
+        weights = self._weights[self.names.index(unit)]
+        return "the centre of inertia of its island" if weights.any() else "the infinite bus"
+
 
 def dead_buses(model: Model, p: Array) -> tuple[str, ...]:
     """Buses that no branch in service joins to a machine or a source, at parameters ``p``."""

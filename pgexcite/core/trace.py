@@ -30,7 +30,8 @@ class Outcome:
         t: time of the last sample kept, s.
         where: path of the machine, bus or equation to blame; ``""`` when completed.
         message: a sentence for a person.
-        active: of a voltage collapse, the limiters that act and the tap changers that have moved, each with what it does.
+        active: of a collapse or a loss of synchronism, the limiters that act and the tap changers that have moved, each with
+            what it does.
     """
 
     ending: Ending

@@ -47,7 +47,7 @@ def test_a_sagging_bus_ends_the_run_with_its_name_the_time_and_what_was_active()
     assert (outcome.ending, outcome.t) == (Ending.VOLTAGE_COLLAPSE, pytest.approx(5.0))
     assert outcome.where == "bus." + min(("INF", "HV", "LV"), key=lambda b: trace[f"bus.{b}.v"][-1])
     taps = trace["transformer.T1.tap_changer.position"][-1]
-    assert outcome.active == (f"transformer.T1.tap_changer at {taps:+.0f}",)
+    assert outcome.active == (f"transformer.T1.tap_changer at position {taps:+.0f}",)
     assert outcome.active[0] in outcome.message
     assert "5.0000 s" in outcome.message
     assert trace.t[-1] == sim.state.t == outcome.t

@@ -116,13 +116,15 @@ def test_the_tap_changer_makes_the_collapse():
     outcome, figures = claim("link_loss")
     assert (outcome.ending.value, outcome.where) == ("voltage_collapse", "bus.Balsfjord")
     assert outcome.t == pytest.approx(123.5, abs=0.5)
-    assert outcome.active == ("transformer.OLTC.tap_changer at -10", "unit.A2G1.limiter acts")
+    assert outcome.active == ("transformer.OLTC.tap_changer at position -10", "unit.A2G1.limiter acts")
     assert figures["load_min"] < 0.86
 
 
 def test_beyond_the_threshold_the_voltage_falls_and_machines_are_lost():
     outcome, figures = claim("link_loss", "simulation.collapse_below=0.0")
-    assert outcome.ending.value == "lost_synchronism"
+    assert (outcome.ending.value, outcome.where) == ("lost_synchronism", "unit.A2G2")
+    assert outcome.active[0] == "transformer.OLTC.tap_changer at position -15"
+    assert outcome.active[0] in outcome.message
     assert figures["primary_min"] < 0.45  # measured 0.407
 
 
