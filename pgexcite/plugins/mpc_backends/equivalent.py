@@ -96,11 +96,14 @@ class _Equivalent(Shooting):
     def solve(self, sample: Sample, u_last: Array) -> Solution:
         """The plan from this sample on; see ``pgexcite.core.mpc.Solver``."""
         solution = super().solve(sample, u_last + self._offset)
+        if self.problem.delayed:
+            self._sent = np.array(u_last)
         return replace(solution, u=solution.u - self._offset, diagnostics=self._told)
 
     def prepare(self, u: Array) -> None:
-        """Keep what was sent: it is in force until the next sample."""
-        self._sent = np.array(u)
+        """Keep what was sent: it is in force until the next sample, but where there is computing delay."""
+        if not self.problem.delayed:
+            self._sent = np.array(u)
 
     def memory(self) -> Mapping[str, Array]:
         """Plan, estimate, and the field voltages seen and sent last."""

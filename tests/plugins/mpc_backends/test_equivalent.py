@@ -191,6 +191,27 @@ def test_what_is_lost_or_late_is_borne():
         assert np.abs(trace["unit.G2.v_t"][trace.t > 3.0] - 1.0).max() < 0.02  # measured 0.004 and 0.012
 
 
+@pytest.mark.parametrize("delayed", [False, True])
+def test_where_a_sample_is_lost_the_field_voltage_is_what_was_in_force(delayed):
+    sim = simulation(FAULT, 1.5, measurement={"loss": 0.4}, delayed=delayed)
+    observer, told = solver_of(sim)._observer, []
+    observe = observer.observe
+
+    def recorded(terminals, e_fd):
+        told.append((terminals is None, e_fd))
+        return observe(terminals, e_fd)
+
+    observer.observe = recorded
+    sim.run()
+    trace = sim.trace()
+    before = np.searchsorted(trace.t, np.arange(1, len(told)) * 0.05 - 1e-9)
+    offset = solver_of(sim)._equivalent.offset
+    pairs = zip(told[1:], trace["unit.G2.e_fd"][before - 1], strict=True)
+    gaps = [abs(e_fd - offset - true) for (lost, e_fd), true in pairs if lost]
+    assert len(gaps) > 5
+    assert max(gaps) < 1e-9
+
+
 def test_a_divergence_hands_over_and_sound_estimates_take_back():
     sim = simulation(FAULT, 4.0, with_transfer(), measurement=NOISY, max_reuse=2)
     sim.run(until=1.0)
