@@ -73,7 +73,11 @@ class LadderOptions:
 
 
 class Ladder:
-    """A controller in one run (the ``Session`` of ``pgexcite.core.controller``)."""
+    """A controller in one run (the ``Session`` of ``pgexcite.core.controller``).
+
+    Attributes:
+        level: of the last sample.
+    """
 
     def __init__(
         self, problem: Problem, solver: Solver, actuator: Actuator, options: LadderOptions, u_0: Array
@@ -90,6 +94,7 @@ class Ladder:
         self._in_charge = False
         self._stepped_down = False
         self._returning = False
+        self.level = 2
 
     # The protocol of a session.
 
@@ -112,8 +117,9 @@ class Ladder:
             self._plan = np.tile(in_force, (self.problem.N_c, 1))
         if sample.ordered:
             self._stepped_down = False
+        self.level = self._level(why, active=sample.active)
         diagnostics = {
-            "level": float(self._level(why, active=sample.active)),
+            "level": float(self.level),
             "predicted_cost": solution.cost,
             "iterations": float(solution.iterations),
             "converged": float(solution.status is Status.CONVERGED),

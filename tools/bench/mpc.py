@@ -162,7 +162,7 @@ def exported(N: int, t_end: float, folder: Path, passes: int) -> Contestant:
     subprocess.run(command, cwd=directory, check=True)
     library = ctypes.CDLL(str(directory / "mpc.so"))
     sizes = [int(n) for n in re.findall(r"MPC_N_[XZDUP] = (\d+)", (directory / "mpc.h").read_text())]
-    fields = [("t", ctypes.c_double), ("startup", ctypes.c_int)]
+    fields = [("t", ctypes.c_double), ("active", ctypes.c_int), ("startup", ctypes.c_int)]
     fields += [(key, ctypes.c_double * max(1, n)) for key, n in zip("xzdup", sizes, strict=True)]
 
     class Input(ctypes.Structure):
@@ -172,8 +172,8 @@ def exported(N: int, t_end: float, folder: Path, passes: int) -> Contestant:
     inputs = []
     for line in (directory / "replay.txt").read_text().splitlines():
         numbers = [float(word) for word in line.split()]
-        item, at = Input(), 2
-        item.t, item.startup = numbers[0], int(numbers[1])
+        item, at = Input(), 3
+        item.t, item.active, item.startup = numbers[0], int(numbers[1]), int(numbers[2])
         for key, n in zip("xzdup", sizes, strict=True):
             getattr(item, key)[:n] = numbers[at : at + n]
             at += n

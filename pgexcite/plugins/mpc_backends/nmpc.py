@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pgexcite.core.controller import Plant, Sample, Surroundings
 from pgexcite.core.declare import par
 from pgexcite.core.errors import ConfigError, Problem
+from pgexcite.core.export import Parts, nmpc_parts
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solver
@@ -108,3 +109,11 @@ class _Perfect(Shooting):
             self.p = sample.p.copy()
             self.p[list(self._wrong)] = list(self._wrong.values())
         return sample.state
+
+    def parts(self, where: str) -> Parts:
+        """Its C; see ``pgexcite.core.export``."""
+        if self._wrong:
+            raise ConfigError(
+                [Problem(f"{where}.options.mismatch", "a model that is wrong on purpose is not exported")]
+            )
+        return nmpc_parts(self, where)

@@ -1,0 +1,125 @@
+"""The files of an export."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from string import Template
+
+from pgexcite.core.codegen import array, generate, loop
+from pgexcite.core.config import Scenario
+from pgexcite.core.errors import ConfigError, PgexciteError, Problem
+from pgexcite.core.export import shared, text
+from pgexcite.core.export.parts import Exportable, Parts
+from pgexcite.core.export.recorder import Recorder
+from pgexcite.core.ladder import Ladder
+from pgexcite.core.simulate import Simulation
+
+
+class ExportError(PgexciteError):
+    """A controller cannot be written as C."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written.
+
+    Attributes:
+        directory: where.
+        name: prefix of files, functions and types.
+        samples: length of the recorded closed loop.
+    """
+
+    directory: Path
+    name: str
+    samples: int
+
+
+def export_c(scenario: Scenario, directory: Path, controller: str = "") -> Exported:
+    """Write a scenario's controller as C, with the scenario's own run as its test.
+
+    Args:
+        scenario: with the controller in it.
+        directory: new, empty, or of an earlier export.
+        controller: its name; may be left out where there is one.
+
+    Raises:
+        ConfigError: no such controller, or something in its configuration cannot be exported.
+        ExportError: something else stands in the directory.
+    """
+    name = _chosen(scenario, controller)
+    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    session = simulation.sessions[name]
+    if not isinstance(session, Ladder) or not isinstance(session.solver, Exportable):
+        raise ConfigError([Problem(f"controller.{name}", "cannot be exported: its backend offers no C")])
+    parts = session.solver.parts(f"controller.{name}")
+    prefix = re.sub(r"\W", "_", name)
+    files = _files(prefix, scenario, session, parts)
+    _ensure_ours(directory, [*files, "replay.txt"])
+    recorder = Recorder(session, parts)
+    simulation.run()
+    files["replay.txt"] = "".join(f"{line}\n" for line in recorder.lines)
+    directory.mkdir(parents=True, exist_ok=True)
+    for file, content in files.items():
+        (directory / file).write_text(content, encoding="utf-8")
+    return Exported(directory, prefix, len(recorder.lines))
+
+
+def _chosen(scenario: Scenario, controller: str) -> str:
+    names = list(scenario.controllers)
+    if controller in names:
+        return controller
+    if not controller and len(names) == 1:
+        return names[0]
+    what = f"there is no controller {controller!r}" if controller else "which of the controllers is to be exported?"
+    raise ConfigError([Problem("controller", what, hint=f"there are: {', '.join(names) or 'none'}")])
+
+
+def _ensure_ours(directory: Path, files: Sequence[str]) -> None:
+    if directory.exists():
+        foreign = sorted({path.name for path in directory.iterdir()} - set(files) - {"build"})
+        if foreign:
+            raise ExportError(
+                f"{directory}: holds {', '.join(foreign[:3])}, which no export wrote; name another directory"
+            )
+
+
+def _files(name: str, scenario: Scenario, session: Ladder, parts: Parts) -> dict[str, str]:
+    commands = session.problem.commands
+    words: dict[str, object] = {
+        "name": name,
+        "NAME": name.upper(),
+        "title": text.comment(scenario.title or name),
+        "config": text.comment(scenario.path.name),
+        "version": version("pgexcite"),
+        "about": parts.about,
+        "tolerance": parts.tolerance,
+        "n_commands": len(commands),
+        "commands": text.listed(commands),
+        **text.input_words(name, parts.inputs),
+    }
+
+    def filled(template: str) -> str:
+        return Template(template).substitute(words)
+
+    shared_loops = [loop(file) for file in ("dense.c", "qp.c", "condensed.c", "ladder.c")]
+    below = [filled(template) for template in (*shared_loops, *parts.templates)]
+    return {
+        f"{name}.h": filled(loop("controller.h")),
+        f"{name}.c": "\n".join([f'#include "{name}.h"\n', _model(session, parts), *below]),
+        f"{name}_replay.c": filled(loop("replay.c")),
+        "CMakeLists.txt": filled(loop("CMakeLists.txt")),
+    }
+
+
+def _model(session: Ladder, parts: Parts) -> str:
+    """The functions of the model, the loops around them, and all numbers."""
+    constants, arrays = shared.program(parts.condensed)
+    of_ladder, start = shared.ladder(session)
+    defined = {"pgexcite_public": "static", **constants, **of_ladder, **parts.constants}
+    loops = generate(parts.functions, defined, rollout=True)
+    numbers = {**arrays, **start, **parts.arrays}
+    return "\n".join([loops, *(array(name, values.ravel()) for name, values in numbers.items())]) + "\n"
