@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 _EPS = 1e-10
 _GAP = 1e-8
+_EPS_INFEASIBLE = 1e-12
 WIDE = 1e20
 _MAX_ITERATIONS = 60
 _MAX_INNER_ITERATIONS = 60
@@ -58,6 +59,9 @@ class QuadraticProgram:
         settings.eps_abs, settings.eps_rel = _EPS, 0.0
         # Without the gap a point 4e-7 off an active bound counts as solved.
         settings.check_duality_gap, settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = True, _GAP, 0.0
+        # A move bound and a box on the same command are parallel rows, and opposite multipliers of theirs look like a certificate
+        # of infeasibility to its own tolerance of 1e-4. What has no solution ends at the caps.
+        settings.eps_primal_inf = settings.eps_dual_inf = _EPS_INFEASIBLE
         settings.max_iter, settings.max_iter_in = _MAX_ITERATIONS, _MAX_INNER_ITERATIONS
         settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
         self._no_equality = np.zeros(0)

@@ -82,7 +82,10 @@ class NamedSolver:
         nothing = QPSolution(np.zeros(n), np.zeros(0), False, 0)
         if not usable(H, g, lower, upper, rows, rows_lower, rows_upper):
             return nothing
+        rows, rows_lower, rows_upper, lower, upper = _folded(rows, rows_lower, rows_upper, lower, upper)
         G, h = _one_sided(rows, rows_lower, rows_upper)
+        if not (lower <= upper).all():
+            return nothing
         if self._name == "proxqp":  # to it a bound that does not exist is a large number, not an infinity
             lower, upper = np.maximum(lower, -WIDE), np.minimum(upper, WIDE)
         problem = qpsolvers.Problem((H + H.T) / 2, g, G, h, None, None, lower, upper)
@@ -95,6 +98,25 @@ class NamedSolver:
         if not solution.found or solution.x is None or not np.isfinite(solution.x).all():
             return nothing
         return QPSolution(np.clip(solution.x, lower, upper), np.zeros(0), True, 0)
+
+
+def _folded(
+    rows: Array | None, rows_lower: Array | None, rows_upper: Array | None, lower: Array, upper: Array
+) -> tuple[Array | None, Array | None, Array | None, Array, Array]:
+    """Rows of one variable as bounds of it.
+
+    Two parallel rows, one inside the other, have opposite multipliers that ProxQP takes for a certificate of infeasibility, and
+    qpsolvers does not pass its tolerance on.
+    """
+    if rows is None or rows_lower is None or rows_upper is None:
+        return rows, rows_lower, rows_upper, lower, upper
+    alone = np.count_nonzero(rows, axis=1) == 1
+    lower, upper = lower.copy(), upper.copy()
+    for row, low, high in zip(rows[alone], rows_lower[alone], rows_upper[alone], strict=True):
+        k = int(np.flatnonzero(row)[0])
+        ends = sorted((low / row[k], high / row[k]))
+        lower[k], upper[k] = max(lower[k], ends[0]), min(upper[k], ends[1])
+    return rows[~alone], rows_lower[~alone], rows_upper[~alone], lower, upper
 
 
 def _one_sided(rows: Array | None, lower: Array | None, upper: Array | None) -> tuple[Array | None, Array | None]:

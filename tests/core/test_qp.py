@@ -1,0 +1,51 @@
+"""The warm-started quadratic programs: against another solver, and where ProxQP's own defaults go wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import qpsolvers
+
+from pgexcite.core.qp import QuadraticProgram
+from pgexcite.core.qp_by_name import NamedSolver
+
+H = np.array([[8.717771058826e-02, 1.953443127785], [1.953443127785, 379.8883179443]])
+G = np.array([-0.221793460823, -25.817593903047])
+
+
+@pytest.mark.parametrize("solver", [QuadraticProgram(2, 2), NamedSolver("proxqp"), NamedSolver("daqp")])
+def test_a_move_bound_beside_a_command_bound_is_no_contradiction(solver):
+    """Parallel rows, one inside the other: with its default tolerance ProxQP calls this infeasible after four iterations."""
+    lower, upper = np.array([-0.611732817719, -0.534319313605]), np.array([0.008267182281, 0.965680686395])
+    found = solver.solve(H, G, lower, upper, np.eye(2), np.array([-0.01, -1.0]), np.array([0.01, 1.0]))
+    assert found.solved
+    first = upper[0]
+    assert found.x == pytest.approx([first, -(G[1] + H[1, 0] * first) / H[1, 1]], abs=1e-9)
+
+
+@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.parametrize("seed", range(20))
+def test_random_programs_agree_with_an_active_set_solver(seed, named):
+    draw = np.random.default_rng(seed)
+    n = int(draw.integers(1, 8))
+    root = draw.normal(size=(n, n))
+    hessian, gradient = root @ root.T * 10 ** draw.uniform(-2, 2) + 0.02 * np.eye(n), 10 * draw.normal(size=n)
+    rows = np.eye(n) - np.eye(n, k=-1)
+    lower, upper = -draw.uniform(0, 1, n), draw.uniform(0, 1, n)
+    reach = draw.uniform(0.01, 1, n)
+    program = NamedSolver("proxqp") if named else QuadraticProgram(n, n)
+    for _ in range(2):  # cold, then warm
+        found = program.solve(hessian, gradient, lower, upper, rows, -reach, reach)
+        wanted = qpsolvers.solve_qp(
+            hessian, gradient, np.vstack((rows, -rows)), np.tile(reach, 2), lb=lower, ub=upper, solver="daqp"
+        )
+        assert found.solved
+        assert found.x == pytest.approx(wanted, abs=1e-6)
+
+
+def test_a_contradiction_is_not_solved():
+    program = QuadraticProgram(2, 1)
+    low, high = np.full(2, -1.0), np.ones(2)
+    found = program.solve(np.eye(2), np.zeros(2), low, high, np.ones((1, 2)), np.array([3.0]), np.array([4.0]))
+    assert not found.solved
+    assert program.solve(np.eye(2), np.zeros(2), low, high, np.ones((1, 2)), np.array([1.0]), np.array([4.0])).solved
