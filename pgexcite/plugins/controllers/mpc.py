@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -17,14 +18,15 @@ from pgexcite.core.measurement import Measurement
 from pgexcite.core.mpc import Backend, SoftBound
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.registry import find
+from pgexcite.plugins.controllers.per_signal import NotNegative, Number, Positive, each
 
 
 class Soft(BaseModel):
-    """A soft bound on an output of the unit."""
+    """A soft bound on an output: of each unit controlled, or anywhere."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    signal: str = Field(description="output of the unit: v_t, i_fd, delta, ...")
+    signal: str = Field(description="output of each unit (v_t, i_fd, delta, ...), or a whole path (bus.HV.v)")
     lower: float = par(-1e6, "pu or rad", "lower bound")
     upper: float = par(1e6, "pu or rad", "upper bound")
     weight: float = par(1e3, "-", "price of a unit of excess, squared, in each sample", gt=0)
@@ -32,6 +34,9 @@ class Soft(BaseModel):
 
 class MPC(BaseModel):
     """Receding-horizon control of excitation with the cost of equation (2) (see ``pgexcite.core.mpc``), of one unit or of several.
+
+    Weights and bounds are one number for all signals, or a list with one for each: ``Q`` and ``V_ref`` in the order of
+    ``voltages``, ``P``, ``R`` and the bounds in the order of the units.
 
     Commands go to a unit's field transfer where it has one (``command = "e_fd"``: the exciter stands by, and control passes both
     ways without a bump), else straight to a constant-field exciter, or to a regulator's set-point (``command = "v_ref"``).
@@ -56,19 +61,19 @@ class MPC(BaseModel):
     N_c: int = par(1, "-", "control horizon, moves of one sample; the command is held after the last", ge=1)
     blocks: tuple[int, ...] = Field((), description="lengths of the moves in samples, instead of N_c (move blocking)")
     growth: float = par(1.0, "-", "ratio of consecutive prediction intervals", ge=1)
-    Q: float = par(300.0, "-", "weight on the voltage error", ge=0)
-    P: float = par(5.0, "-", "weight on the speed error", ge=0)
-    R: float = par(0.01, "-", "weight on the move", ge=0)
+    Q: NotNegative = par(300.0, "-", "weight on the voltage error")
+    P: NotNegative = par(5.0, "-", "weight on the speed error")
+    R: NotNegative = par(0.01, "-", "weight on the move")
     terminal: float = par(1.0, "-", "factor on Q and P at the last sample", gt=0)
-    u_min: float = par(-3.2, "pu", "lower bound of the command")
-    u_max: float = par(3.2, "pu", "upper bound of the command")
-    du_max: float = par(1e6, "pu", "largest move in one sample", gt=0)
+    u_min: Number = par(-3.2, "pu", "lower bound of the command")
+    u_max: Number = par(3.2, "pu", "upper bound of the command")
+    du_max: Positive = par(1e6, "pu", "largest move in one sample")
     soft: tuple[Soft, ...] = Field((), description="soft bounds on outputs of the unit")
-    V_ref: float = par(0.0, "pu", "voltage reference; 0 takes each voltage's initial value", ge=0)
-    V_ref_known: tuple[tuple[float, float], ...] = Field(
+    V_ref: NotNegative = par(0.0, "pu", "voltage reference; 0 takes each voltage's initial value")
+    V_ref_known: tuple[tuple[float, NotNegative], ...] = Field(
         (), description="changes of V_ref known in advance, as [t, V_ref]"
     )
-    V_ref_steps: tuple[tuple[float, float], ...] = Field(
+    V_ref_steps: tuple[tuple[float, NotNegative], ...] = Field(
         (), description="changes of V_ref that are not known before they happen, as [t, V_ref]"
     )
     disturbance_known: bool = Field(False, description="whether the events of the run are known in advance")
@@ -94,8 +99,20 @@ class MPC(BaseModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.u_min >= self.u_max:
+        for name, n in self._lengths().items():
+            try:
+                each(getattr(self, name), n)
+            except ValueError as cause:
+                raise ValueError(f"{name} = {cause}") from cause
+        low, high = (each(bound, len(self.units)) for bound in (self.u_min, self.u_max))
+        if not (low < high).all():
             raise ValueError(f"u_min = {self.u_min} must be below u_max = {self.u_max}")
+        for name in ("V_ref_known", "V_ref_steps"):
+            for t, value in getattr(self, name):
+                try:
+                    each(value, len(self.tracked))
+                except ValueError as cause:
+                    raise ValueError(f"{name} at t = {t:g}: {cause}") from cause
         if self.blocks and (min(self.blocks) < 1 or sum(self.blocks) > self.N_p):
             raise ValueError(
                 f"blocks = {list(self.blocks)} must be positive and add up to N_p = {self.N_p} at the most"
@@ -104,6 +121,11 @@ class MPC(BaseModel):
             raise ValueError(f"N_c = {self.N_c} must not exceed N_p = {self.N_p}")
         self._backend()
         return self
+
+    def _lengths(self) -> dict[str, int]:
+        """How many numbers a list has, by field: one for each voltage tracked or for each unit."""
+        of_units = dict.fromkeys(("P", "R", "u_min", "u_max", "du_max"), len(self.units))
+        return dict.fromkeys(("Q", "V_ref"), len(self.tracked)) | of_units
 
     def _backend(self) -> Backend:
         backend: Backend = find("mpc_backend", self.backend).model_validate(dict(self.options))
@@ -127,11 +149,15 @@ class MPC(BaseModel):
 
     def measures(self) -> Sequence[str]:
         """The units' own terminals, what is tracked or bounded, and the set-points it moves."""
-        signals = ("v_t", "omega", "p_e", "q_e", "e_fd", "i_fd", *(bound.signal for bound in self.soft))
+        signals = ("v_t", "omega", "p_e", "q_e", "e_fd", "i_fd")
+        own = [f"{unit}.{name}" for unit in self.units for name in signals]
+        bounded = [path for bound in self.soft for path in self._bounded(bound)]
         moved = [f"{unit}.exciter.v_ref" for unit in self.units] if self.command == "v_ref" else []
-        return list(
-            dict.fromkeys([*(f"{unit}.{name}" for unit in self.units for name in signals), *self.tracked, *moved])
-        )
+        return list(dict.fromkeys([*own, *bounded, *self.tracked, *moved]))
+
+    def _bounded(self, bound: Soft) -> list[str]:
+        """Paths of the outputs a soft bound is on."""
+        return [bound.signal] if "." in bound.signal else [f"{unit}.{bound.signal}" for unit in self.units]
 
     def actuator(self, setpoints: Mapping[str, float]) -> Actuator:
         """Where its commands go.
@@ -168,18 +194,14 @@ class MPC(BaseModel):
         """
         actuator = self.actuator(surroundings.u_0)
         u_0 = np.array([surroundings.u_0[path] for path in actuator.setpoints])
+        problem = self._problem(actuator, surroundings)
         problems = [
-            Problem(
-                path,
-                f"its initial value is outside u_min = {self.u_min:g} .. u_max = {self.u_max:g}",
-                round(float(value), 5),
-            )
-            for path, value in zip(actuator.setpoints, u_0, strict=True)
-            if not self.u_min <= value <= self.u_max
+            Problem(path, f"its initial value is outside u_min = {low:g} .. u_max = {high:g}", round(float(value), 5))
+            for path, value, low, high in zip(actuator.setpoints, u_0, problem.u_min, problem.u_max, strict=True)
+            if not low <= value <= high
         ]
         if problems:
             raise ConfigError(problems)
-        problem = self._problem(actuator, surroundings)
         solver = self._backend().start(problem, surroundings, plant)
         options = LadderOptions(
             max_reuse=self.max_reuse,
@@ -192,7 +214,9 @@ class MPC(BaseModel):
         return Ladder(problem, solver, actuator, options, u_0)
 
     def _problem(self, actuator: Actuator, surroundings: Surroundings) -> ControlProblem:
-        n_u, n_v = len(self.units), len(self.tracked)
+        of = {name: each(getattr(self, name), n) for name, n in self._lengths().items()}
+        n_v = len(self.tracked)
+        at_first = np.array([surroundings.y_0[path] for path in self.tracked])
         known: tuple[Change, ...] = ()
         if self.disturbance_known:
             known = tuple(
@@ -205,20 +229,18 @@ class MPC(BaseModel):
             commands=actuator.setpoints,
             voltages=self.tracked,
             speeds=tuple(f"{unit}.omega" for unit in self.units),
-            Q=np.full(n_v, self.Q),
-            P=np.full(n_u, self.P),
-            R=np.full(n_u, self.R),
-            u_min=np.full(n_u, self.u_min),
-            u_max=np.full(n_u, self.u_max),
-            du_max=np.full(n_u, self.du_max if self.du_max < 1e6 else np.inf),
-            V_ref=np.array([self.V_ref or surroundings.y_0[path] for path in self.tracked]),
+            Q=of["Q"],
+            P=of["P"],
+            R=of["R"],
+            u_min=of["u_min"],
+            u_max=of["u_max"],
+            du_max=np.where(of["du_max"] < 1e6, of["du_max"], np.inf),
+            V_ref=np.where(of["V_ref"] > 0, of["V_ref"], at_first),
             terminal=self.terminal,
-            soft=tuple(
-                SoftBound(f"{unit}.{s.signal}", s.lower, s.upper, s.weight) for unit in self.units for s in self.soft
-            ),
+            soft=tuple(SoftBound(path, s.lower, s.upper, s.weight) for s in self.soft for path in self._bounded(s)),
             growth=self.growth,
-            previews=tuple((t, np.full(n_v, value)) for t, value in sorted(self.V_ref_known)),
-            steps=tuple((t, np.full(n_v, value)) for t, value in sorted(self.V_ref_steps)),
+            previews=tuple((t, each(value, n_v)) for t, value in sorted(self.V_ref_known, key=itemgetter(0))),
+            steps=tuple((t, each(value, n_v)) for t, value in sorted(self.V_ref_steps, key=itemgetter(0))),
             known=known,
             delayed=self.delayed,
             fixed=actuator.engaged,
