@@ -39,7 +39,7 @@ class Horizons:
         problem = self.problem
         count = max(1, round(problem.dt / self.h))
         ends = t + np.cumsum(problem.intervals())
-        pending = [(self._instant(change), change) for change in problem.known]
+        pending = [(self.instant(change), change) for change in problem.known]
         pending = [item for item in pending if t + _SAME_INSTANT < item[0] < ends[-1] - _SAME_INSTANT]
         row_u, row_p = self._fixed(u), np.array(p, dtype=float)
         us, ps = [row_u], [row_p]
@@ -76,18 +76,19 @@ class Horizons:
         """Commands and parameters in force at ``t``, from those at the start of the run and the changes that are known."""
         u = self._fixed(u)
         for change in self.problem.known:
-            if self._instant(change) <= t + _SAME_INSTANT:
+            if self.instant(change) <= t + _SAME_INSTANT:
                 u, p = self._changed(u, p, change)
         return u, p
 
     def between(self, t: float, until: float, u: Array, p: Array) -> tuple[Array, Array]:
         """Commands and parameters in force at ``until`` where ``u`` and ``p`` were at ``t``, as far as changes are known."""
         for change in self.problem.known:
-            if t + _SAME_INSTANT < self._instant(change) <= until + _SAME_INSTANT:
+            if t + _SAME_INSTANT < self.instant(change) <= until + _SAME_INSTANT:
                 u, p = self._changed(u, p, change)
         return u, p
 
-    def _instant(self, change: Change) -> float:
+    def instant(self, change: Change) -> float:
+        """When a known change takes place, s."""
         return float(np.ceil(change.t / self.grid - 1e-6) * self.grid)
 
     def _fixed(self, u: Array) -> Array:

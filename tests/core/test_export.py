@@ -38,6 +38,14 @@ CASES = {
     "soft bound, rate": ["controller.mpc.N_p=10", "controller.mpc.N_c=5", "controller.mpc.du_max=0.3", SOFT],
     "reference steps": ["controller.mpc.V_ref_known=[[2.0, 1.02]]", "controller.mpc.V_ref_steps=[[2.5, 0.98]]"],
     "behind a transfer": TRANSFER,
+    "delayed": ["controller.mpc.delayed=true"],
+    "known": ["controller.mpc.disturbance_known=true", "controller.mpc.N_p=10"],
+    "known, delayed, growing": [
+        "controller.mpc.disturbance_known=true",
+        "controller.mpc.delayed=true",
+        "controller.mpc.N_p=10",
+        "controller.mpc.growth=1.3",
+    ],
     "backward Euler": ["simulation.rule=backward_euler", "controller.mpc.N_c=2"],
 }
 
@@ -52,6 +60,27 @@ def test_the_replayed_commands_are_those_of_python(case, tmp_path):
     assert figures["largest difference of a command"] < 1e-6  # measured 3e-9 .. 3e-7, where ProxQP's tolerance puts it
     assert figures["samples on another level"] == 0
     assert figures["samples with another number of iterations"] == 0
+
+
+CONVERGED = {
+    "published": [],
+    "moves without transitions": ["controller.mpc.N_c=2"],
+    "long": ["controller.mpc.N_p=20", "controller.mpc.N_c=20"],
+    "delayed, rate": ["controller.mpc.delayed=true", "controller.mpc.du_max=0.3"],
+    "soft bound": ["controller.mpc.N_p=10", "controller.mpc.N_c=3", SOFT],
+}
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("case", CONVERGED)
+def test_converged_plans_are_those_of_python(case, tmp_path):
+    settings = ["simulation.t_end=4", 'controller.mpc.options={mode="converged"}', *CONVERGED[case]]
+    export_c(load(NMPC, settings), tmp_path / "out")
+    code, figures = exported.replay(tmp_path / "out")
+    assert code == 0
+    assert figures["samples"] == 80
+    assert figures["largest difference of a command"] < 1e-4  # measured 3e-5: see TOLERANCE_CONVERGED
+    assert figures["samples on another level"] == 0
 
 
 @pytest.mark.compiler
@@ -99,10 +128,7 @@ def test_the_levels_of_the_ladder(tmp_path):
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [
-        (["controller.mpc.delayed=true"], "computing delay"),
-        (["controller.mpc.disturbance_known=true"], "known disturbances"),
         (["controller.mpc.R=0.0"], "must be positive"),
-        (['controller.mpc.options={mode="converged"}'], "only mode"),
         (["controller.mpc.options={candidates=3}"], "candidate plans"),
         (['controller.mpc.options={mismatch={"unit.G2.machine.H"=3.0}}'], "wrong on purpose"),
         (["simulation.rule=trapezoidal"], "must be another"),

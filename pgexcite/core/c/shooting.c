@@ -1,8 +1,10 @@
-/* Plans by shooting: the algorithm of pgexcite.core.shooting. Goes below step.c, rollout.c and ladder.c.
+/* Plans by shooting: the algorithm of pgexcite.core.shooting. Goes below step.c, rollout.c, ladder.c and horizon.c.
 
-   Expects the pieces of the horizon and N_SELECTED outputs, those of the program. */
+   Expects N_SELECTED outputs, those of the program. */
 
-#define N_Q (N_X + N_V)
+/* Derivatives to the state come before those to the moves, where there are any. */
+#define N_S (TRANSITION ? N_X : 0)
+#define N_Q (N_S + N_V)
 
 typedef struct {
     double y[HORIZON * N_SELECTED], G[HORIZON * N_Q * N_SELECTED];
@@ -18,50 +20,82 @@ static int has_plan;
 
 /* What was prepared for the next sample, and the sample it is prepared from. */
 static int prepared, has_origin;
-static double prepared_plan[N_V], prepared_x[AT_LEAST_1(N_X)], prepared_p[AT_LEAST_1(N_P)];
+static double prepared_plan[N_V], prepared_p[AT_LEAST_1(N_P)];
 static Prediction ready;
-static Point origin;
-static double origin_p[AT_LEAST_1(N_P)];
+static Point expected, origin;
+static double origin_t, origin_p[AT_LEAST_1(N_P)];
 
-/* Set-points in force while this controller is in charge. */
-static void fix(double *u) {
-    int k;
-    for (k = 0; k < N_FIXED; k++) u[FIXED_AT[k]] = FIXED_TO[k];
+static int differ(const double *a, const double *b, int n) {
+    int i;
+    for (i = 0; i < n; i++)
+        if (a[i] != b[i]) return 1;
+    return 0;
 }
 
-static int predict(const Point *from, const double *p, const double *moves, Prediction *to) {
-    static double x[AT_LEAST_1(N_X)], z[AT_LEAST_1(N_Z)], d[AT_LEAST_1(N_D)], u[AT_LEAST_1(N_U)];
-    static double dy[HORIZON * N_COLUMNS * N_SELECTED], dx[HORIZON * N_COLUMNS * AT_LEAST_1(N_X)], X[2 * N_Q * AT_LEAST_1(N_X)];
+/* Derivatives of all outputs to the first move. */
+#define TO_MOVES(at) ((at)->G + N_S * N_SELECTED)
+#define STRIDE (N_Q * N_SELECTED)
+
+static int predict(const Point *from, const Horizon *over, const double *moves, Prediction *to) {
+    static double x[AT_LEAST_1(N_X)], z[AT_LEAST_1(N_Z)], d[AT_LEAST_1(N_D)];
+    static double dy[HORIZON * N_COLUMNS * N_SELECTED], dx[HORIZON * N_COLUMNS * AT_LEAST_1(N_X)];
+    static double X[2 * (N_X + N_V) * AT_LEAST_1(N_X)];
     int done;
-    memcpy(x, from->x, sizeof x); memcpy(z, from->z, sizeof z); memcpy(d, from->d, sizeof d); memcpy(u, from->u, sizeof u);
-    fix(u);
+    memcpy(x, from->x, sizeof x); memcpy(z, from->z, sizeof z); memcpy(d, from->d, sizeof d);
     memset(dy, 0, sizeof dy);
-    done = pgexcite_rollout(RULE, N_PIECES, PIECE_COUNT, PIECE_LENGTH, PIECE_MOVE, PIECE_ROW, PIECE_END, COMMANDS, from->startup,
-                            x, z, d, p, u, moves, 1, to->y, dy, dx);
-    if (done != N_PIECES || !all_finite(to->y, HORIZON * N_SELECTED) || !all_finite(dy, HORIZON * N_COLUMNS * N_SELECTED)) return 0;
-    pgexcite_condense(HORIZON, N_MOVES, SAMPLE_MOVE, dy, dx, X, to->G);
+    done = pgexcite_rollout(RULE, over->pieces, over->count, over->length, over->move, over->row, over->end, COMMANDS,
+                            from->startup, x, z, d, over->p, over->u, moves, 1, to->y, dy, dx);
+    if (done != over->pieces || !all_finite(to->y, HORIZON * N_SELECTED) || !all_finite(dy, HORIZON * N_COLUMNS * N_SELECTED))
+        return 0;
+    if (TRANSITION)
+        pgexcite_condense(HORIZON, N_MOVES, SAMPLE_MOVE, dy, dx, X, to->G);
+    else
+        memcpy(to->G, dy, sizeof to->G);
     return 1;
 }
 
-/* One sample of the plant under these commands. */
-static int advance(Point *at, const double *p, const double *commands) {
-    static double rows_x[FIRST_COUNT * AT_LEAST_1(N_X)], rows_z[FIRST_COUNT * AT_LEAST_1(N_Z)];
-    static double rows_d[FIRST_COUNT * AT_LEAST_1(N_D)], rows_y[FIRST_COUNT * AT_LEAST_1(N_Y)], wanted[AT_LEAST_1(N_U)];
+/* Solves the algebraic unknowns again under these commands. */
+static int settle_at(Point *at, const double *u, const double *p) {
     static Stage s;
-    int i, changed = 0;
-    memcpy(wanted, at->u, sizeof wanted);
-    fix(wanted);
-    for (i = 0; i < N_COMMANDS; i++) wanted[COMMANDS[i]] = commands[i];
-    for (i = 0; i < N_U; i++) changed |= wanted[i] != at->u[i];
-    if (changed) {
-        memcpy(at->u, wanted, sizeof wanted);
-        s.d = at->d; s.u = at->u; s.p = p; s.c = 0;
-        history_at(&s, at->x, at->z);
-        if (!settle(&s, at->x, at->z)) return 0;
-        at->startup = STARTUP_STEPS;
+    memcpy(at->u, u, sizeof at->u);
+    s.d = at->d; s.u = at->u; s.p = p; s.c = 0;
+    history_at(&s, at->x, at->z);
+    at->startup = STARTUP_STEPS;
+    return settle(&s, at->x, at->z);
+}
+
+static int step_on(Point *at, const double *p, double h, int count) {
+    static double rows_x[FIRST_COUNT * AT_LEAST_1(N_X)], rows_z[FIRST_COUNT * AT_LEAST_1(N_Z)];
+    static double rows_d[FIRST_COUNT * AT_LEAST_1(N_D)], rows_y[FIRST_COUNT * AT_LEAST_1(N_Y)];
+    for (; count > 0; count -= FIRST_COUNT) {
+        int n = count < FIRST_COUNT ? count : FIRST_COUNT;
+        if (pgexcite_advance(RULE, h, n, &at->startup, at->x, at->z, at->d, at->u, p, rows_x, rows_z, rows_d, rows_y) != n) return 0;
     }
-    return pgexcite_advance(RULE, PIECE_LENGTH[0], FIRST_COUNT, &at->startup, at->x, at->z, at->d, at->u, p, rows_x, rows_z, rows_d,
-                            rows_y) == FIRST_COUNT;
+    return 1;
+}
+
+/* One sample under these commands, from t, with all that is known to happen by its end; p too is moved on. */
+static int advance(Point *at, double t, double *p, const double *commands) {
+    static Horizon over;
+    static double wanted[AT_LEAST_1(N_U)];
+    const double *row_p = over.p;
+    int j = 0, i, row = -1;
+    horizon_at(t, at->u, p, &over);
+    do {
+        if (over.row[j] != row) {
+            int first = row < 0;
+            row = over.row[j];
+            row_p = over.p + row * N_P;
+            memcpy(wanted, over.u + row * N_U, sizeof(double) * N_U);
+            for (i = 0; i < N_COMMANDS; i++) wanted[COMMANDS[i]] = commands[i];
+            if ((!first || differ(wanted, at->u, N_U)) && !settle_at(at, wanted, row_p)) return 0;
+        }
+        if (!step_on(at, row_p, over.length[j], over.count[j])) return 0;
+    } while (!over.end[j++]);
+    memcpy(wanted, over.u, sizeof(double) * N_U);
+    between(t, t + ENDS[0], wanted, p);
+    for (i = 0; i < N_COMMANDS; i++) wanted[COMMANDS[i]] = commands[i];
+    return !(differ(p, row_p, N_P) || differ(wanted, at->u, N_U)) || settle_at(at, wanted, p);
 }
 
 static double largest(const double *a, int n) {
@@ -72,18 +106,14 @@ static double largest(const double *a, int n) {
     return found;
 }
 
-/* Derivatives of all outputs to the first move. */
-#define TO_MOVES(at) ((at)->G + N_X * N_SELECTED)
-#define STRIDE (N_Q * N_SELECTED)
-
 /* Whether the sample is the one that was prepared for. */
-static int is_expected(const double *x, const double *p) {
+static int is_expected(const Point *at, const double *p) {
     int i;
-    if (!prepared) return 0;
-    for (i = 0; i < N_P; i++)
-        if (p[i] != prepared_p[i]) return 0;
+    if (!prepared || differ(p, prepared_p, N_P) || differ(at->d, expected.d, N_D)) return 0;
+    for (i = 0; i < N_OTHERS; i++)
+        if (at->u[OTHERS[i]] != expected.u[OTHERS[i]]) return 0;
     for (i = 0; i < N_X; i++)
-        if (!(fabs(x[i] - prepared_x[i]) <= JUMP)) return 0;
+        if (!(fabs(at->x[i] - expected.x[i]) <= JUMP)) return 0;
     return 1;
 }
 
@@ -95,7 +125,7 @@ static int feedback(const double *x, const double *u_last, const double *targets
     for (j = 0; j < HORIZON; j++)
         for (s = 0; s < N_SELECTED; s++) {
             double value = ready.y[j * N_SELECTED + s];
-            for (i = 0; i < N_X; i++) value += ready.G[(j * N_Q + i) * N_SELECTED + s] * (x[i] - prepared_x[i]);
+            for (i = 0; i < N_S; i++) value += ready.G[(j * N_Q + i) * N_SELECTED + s] * (x[i] - expected.x[i]);
             y[j * N_SELECTED + s] = value;
         }
     if (!direction_of(y, TO_MOVES(&ready), STRIDE, targets, prepared_plan, u_last, step, &slope)) return ${NAME}_QP_FAILED;
@@ -107,23 +137,32 @@ static int feedback(const double *x, const double *u_last, const double *targets
     return ${NAME}_ITERATED;
 }
 
+/* The first plan that the model can be stepped through: the last one, the commands in force, as high or as low as can be. */
+static int begin(const Point *at, const Horizon *over, const double *u_last, double *from, Prediction *to) {
+    static double wanted[N_V];
+    int k, i;
+    for (k = has_plan ? 0 : 1; k < 4; k++) {
+        if (k == 0)
+            shift(plan, wanted);
+        else
+            for (i = 0; i < N_V; i++) wanted[i] = k == 1 ? u_last[i % N_COMMANDS] : k == 2 ? UPPER[i] : LOWER[i];
+        reach(wanted, u_last, from);
+        if (predict(at, over, from, to)) return 1;
+    }
+    return 0;
+}
+
 /* Gauss-Newton with a line search on the true cost. */
-static int iterate(const Point *at, const double *p, const double *u_last, const double *targets, int count, double *found,
-                   double *cost, int *iterations) {
+static int iterate(const Point *at, double t, const double *p, const double *u_last, const double *targets, int count,
+                   double *found, double *cost, int *iterations) {
     static Prediction first, second;
+    static Horizon over;
     static double trial[N_V], step[N_V];
     Prediction *here = &first, *there = &second, *swap;
     double slope, length, scale, trial_cost = 0;
-    int i, status = ${NAME}_ITERATED, known = 0, better;
-    if (has_plan) {
-        shift(plan, found);
-        for (i = 0; i < N_V; i++) found[i] = clipped(found[i], i);
-        known = predict(at, p, found, here);
-    }
-    if (!known) {
-        for (i = 0; i < N_V; i++) found[i] = clipped(u_last[i % N_COMMANDS], i);
-        if (!predict(at, p, found, here)) return ${NAME}_PREDICTION_FAILED;
-    }
+    int i, status = ${NAME}_ITERATED, better;
+    horizon_at(t, at->u, p, &over);
+    if (!begin(at, &over, u_last, found, here)) return ${NAME}_PREDICTION_FAILED;
     *cost = cost_of(here->y, targets, found, u_last);
     for (*iterations = 0; *iterations < count;) {
         ++*iterations;
@@ -134,7 +173,7 @@ static int iterate(const Point *at, const double *p, const double *u_last, const
         better = 0;
         for (scale = 1; !better && scale >= SHORTEST; scale /= 2) {
             for (i = 0; i < N_V; i++) trial[i] = clipped(found[i] + scale * step[i], i);
-            if (!predict(at, p, trial, there)) continue;
+            if (!predict(at, &over, trial, there)) continue;
             trial_cost = cost_of(there->y, targets, trial, u_last);
             better = trial_cost <= *cost + DECREASE * scale * (slope < 0 ? slope : 0);
         }
@@ -144,4 +183,49 @@ static int iterate(const Point *at, const double *p, const double *u_last, const
         swap = here; here = there; there = swap;
     }
     return status;
+}
+
+/* A plan from this point on; found is a plan where the status says so. */
+static int plan_from(const Point *at, double t, const double *p, const double *u_last, double *found, double *cost,
+                     int *iterations) {
+    static double targets[HORIZON * N_TRACKED];
+    int status, count = CONVERGE || !has_plan ? MAX_PLAN_ITERATIONS : JUMP_ITERATIONS;
+    origin = *at;
+    memcpy(origin_p, p, sizeof origin_p);
+    origin_t = t;
+    has_origin = 0;
+    if (DELAYED) {
+        if (!advance(&origin, t, origin_p, u_last)) return ${NAME}_PREDICTION_FAILED;
+        origin_t += ENDS[0];
+    }
+    has_origin = 1;
+    references(origin_t, t, targets);
+    if (!CONVERGE && is_expected(&origin, origin_p)) {
+        *iterations = 1;
+        status = feedback(origin.x, u_last, targets, found, cost);
+    } else {
+        status = iterate(&origin, origin_t, origin_p, u_last, targets, count, found, cost, iterations);
+    }
+    if (status <= ${NAME}_ITERATED) {
+        memcpy(plan, found, sizeof plan);
+        has_plan = 1;
+    }
+    return status;
+}
+
+/* Linearises around the plan the next sample will start from, at the state expected then. */
+static void prepare_next(const double *command) {
+    static Horizon over;
+    static double moved[N_V];
+    prepared = 0;
+    if (CONVERGE || !has_origin || !has_plan || !all_finite(command, N_COMMANDS)) return;
+    has_origin = 0; /* the point is moved on in place */
+    if (!advance(&origin, origin_t, origin_p, command)) return;
+    shift(plan, moved);
+    reach(moved, command, prepared_plan);
+    horizon_at(origin_t + ENDS[0], origin.u, origin_p, &over);
+    if (!predict(&origin, &over, prepared_plan, &ready)) return;
+    expected = origin;
+    memcpy(prepared_p, origin_p, sizeof prepared_p);
+    prepared = 1;
 }

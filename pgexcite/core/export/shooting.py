@@ -1,4 +1,4 @@
-"""Plans by shooting as C: real-time iterations from the plant's own state."""
+"""Plans by shooting as C, and the controller that plans from the plant's own state."""
 
 from __future__ import annotations
 
@@ -21,19 +21,26 @@ Numbers = NDArray[np.float64] | NDArray[np.int32]
 TOLERANCE = 1e-6
 """Measured 3e-9 .. 3e-7 pu, where ProxQP's tolerance puts it."""
 
-_ABOUT = """One predictive controller for one plant: real-time iterations on the plant's own step, from the plant's own state, as
+TOLERANCE_CONVERGED = 1e-4
+"""Where ProxQP's rounding ends an iteration one program sooner or later than the exact solution: measured 3e-5 pu."""
+
+_ABOUT = """One predictive controller for one plant: plans on the plant's own step, from the plant's own state, as
    pgexcite.core.shooting makes them, and the checks of pgexcite.core.ladder."""
+DELAYED = """
+
+   A plan takes a sample to compute: the command answered is for the next sample, and what is to be sent now was answered in
+   the last."""
+"""Of a problem with computing delay."""
 
 
 def nmpc_parts(shooting: Shooting, where: str) -> Parts:
-    """Parts of real-time iterations from a state that is told.
+    """Parts of plans from a state that is told.
 
     Raises:
         ConfigError: something in the configuration cannot be exported.
     """
     _refuse(where, shooting)
-    model, options = shooting.kernel.model, shooting.options
-    functions, pieces = _functions_and_pieces(shooting)
+    model, (functions, constants, arrays) = shooting.kernel.model, planning(shooting)
     names = {"x": model.x_names, "z": model.z_names, "d": model.d_names, "u": model.u_names, "p": model.p_names}
     about = {
         "x": "the plant's differential states",
@@ -42,30 +49,22 @@ def nmpc_parts(shooting: Shooting, where: str) -> Parts:
         "u": "its set-points in force",
         "p": "its parameters",
     }
-    constants = {
-        "jump": repr(options.jump),
-        "plan_tolerance": repr(options.tolerance),
-        "max_plan_iterations": options.max_iterations,
-        "jump_iterations": options.jump_iterations,
-        "shortest": repr(SHORTEST),
-        "decrease": repr(DECREASE),
-    }
     return Parts(
-        about=_ABOUT,
+        about=_ABOUT + DELAYED * shooting.problem.delayed,
         inputs=(
             Input("t", "s, on the clock of the references"),
             Input("active", "whether the controller is in charge", kind="int"),
             Input("startup", "backward-Euler steps left after a discontinuity (trapezoidal rule); else 0", kind="int"),
             *(Input.of(key, about[key], names[key]) for key in names),
-            Input("u_last", "commands in force until now", len(shooting.problem.commands)),
+            Input("u_last", "commands in force until the plan begins", len(shooting.problem.commands)),
         ),
         record=_record,
         condensed=shooting.condensed,
         functions=functions,
-        constants=shooting.kernel.constants() | pieces[0] | constants,
-        arrays=pieces[1],
-        templates=(loop("shooting.c"), loop("nmpc.c")),
-        tolerance=TOLERANCE,
+        constants=constants,
+        arrays=arrays,
+        templates=tuple(loop(file) for file in ("horizon.c", "shooting.c", "nmpc.c")),
+        tolerance=TOLERANCE if shooting.options.mode == "rti" else TOLERANCE_CONVERGED,
     )
 
 
@@ -78,14 +77,7 @@ def _record(sample: Sample, u_last: Array) -> list[Array | float]:
 
 def _refuse(where: str, shooting: Shooting) -> None:
     """Refuse what the exported controller does not do."""
-    problem = shooting.problem
     unsupported = {
-        "disturbance_known": (bool(problem.known), "known disturbances are not exported"),
-        "delayed": (problem.delayed, "compensation of computing delay is not exported"),
-        "options.mode": (
-            shooting.options.mode != "rti",
-            'only mode = "rti" is exported: its iterations have a fixed cap',
-        ),
         "options.candidates": (shooting.options.candidates > 0, "candidate plans are not exported"),
         "rule": (
             shooting.rule == "trapezoidal",
@@ -99,37 +91,71 @@ def _refuse(where: str, shooting: Shooting) -> None:
         raise ConfigError(problems)
 
 
-def _functions_and_pieces(shooting: Shooting) -> tuple[list[ca.Function], tuple[dict[str, object], dict[str, Numbers]]]:
-    """The functions of the model, and the constants and arrays of a rollout over the horizon."""
-    kernel, problem = shooting.kernel, shooting.problem
+def planning(shooting: Shooting) -> tuple[list[ca.Function], dict[str, object], dict[str, Numbers]]:
+    """What ``horizon.c`` and ``shooting.c`` are to know: functions of the model, constants and arrays."""
+    kernel, problem, options = shooting.kernel, shooting.problem, shooting.options
     model, functions = kernel.model, kernel.functions
     commands = np.array([model.position("u", path) for path in problem.commands], dtype=np.int32)
     outputs = np.array([model.position("y", path) for path in shooting.condensed.outputs()], dtype=np.int32)
-    columns = len(model.x_names) + commands.size
-    sensitivities = write_sensitivities(kernel, commands, outputs, columns)
-    horizon = shooting.horizons.at(0.0, np.zeros(len(model.u_names)), np.zeros(len(model.p_names)))
+    converge = options.mode == "converged"
+    # What was prepared is corrected for the state.
+    transitions = shooting.predictor.transitions or not converge
+    columns = len(model.x_names) + commands.size if transitions else problem.N_c * commands.size
     fixed = {model.position("u", path): value for path, value in problem.fixed.items()}
+    others = [k for k in range(len(model.u_names)) if k not in fixed and k not in commands]
+    known_constants, known_arrays = _known(shooting)
     constants: dict[str, object] = {
         "n_commands": commands.size,
         "n_columns": columns,
         "n_selected": outputs.size,
-        "transition": 1,
-        "n_pieces": horizon.counts.size,
-        "first_count": int(horizon.counts[0]),
+        "transition": int(transitions),
+        "first_count": max(1, round(problem.dt / shooting.horizons.h)),
         "rule": RULES.index(shooting.rule),
         "n_fixed": len(fixed),
+        "n_others": len(others),
+        "delayed": int(problem.delayed),
+        "converge": int(converge),
+        "jump": options.jump,
+        "plan_tolerance": options.tolerance,
+        "max_plan_iterations": options.max_iterations,
+        "jump_iterations": options.jump_iterations,
+        "shortest": SHORTEST,
+        "decrease": DECREASE,
     }
     arrays: dict[str, Numbers] = {
         "COMMANDS": commands,
-        "PIECE_COUNT": horizon.counts,
-        "PIECE_LENGTH": horizon.lengths,
-        "PIECE_MOVE": horizon.moves,
-        "PIECE_ROW": horizon.rows,
-        "PIECE_END": horizon.ends,
-        "SAMPLE_MOVE": horizon.sample_moves,
+        "OTHERS": np.array(others, dtype=np.int32),
+        "INTERVALS": problem.intervals(),
+        "SAMPLE_MOVE": problem.moves_per_sample(),
         "FIXED_AT": np.array(list(fixed), dtype=np.int32),
         "FIXED_TO": np.array(list(fixed.values()), dtype=float),
     }
+    sensitivities = write_sensitivities(kernel, commands, outputs, columns)
     assert functions.newton is not None
     loops = [functions.newton, functions.history, functions.update, functions.outputs, *sensitivities]
-    return loops, (constants, arrays)
+    return loops, kernel.constants() | constants | known_constants, arrays | known_arrays
+
+
+def _known(shooting: Shooting) -> tuple[dict[str, object], dict[str, Numbers]]:
+    """Known changes to come as assignments to elements of ``u`` and ``p``; what the model does not have is left out."""
+    index, horizons, known = shooting.kernel.model.index, shooting.horizons, shooting.problem.known
+    begins, assignments = [0], []
+    for change in known:
+        for values, add in ((change.values, 0.0), (change.increments or {}, 1.0)):
+            assignments += [
+                (float(group == "p"), float(index[group][path]), add, value)
+                for path, value in values.items()
+                for group in ("u", "p")
+                if path in index[group]
+            ]
+        begins.append(len(assignments))
+    table = np.array(assignments, dtype=float).reshape(-1, 4)
+    arrays: dict[str, Numbers] = {
+        "KNOWN_T": np.array([horizons.instant(change) for change in known], dtype=float),
+        "KNOWN_FROM": np.array(begins, dtype=np.int32),
+        "SET_P": table[:, 0].astype(np.int32),
+        "SET_AT": table[:, 1].astype(np.int32),
+        "SET_ADD": table[:, 2],
+        "SET_VALUE": table[:, 3],
+    }
+    return {"n_known": len(known)}, arrays
