@@ -1,16 +1,37 @@
-"""Events: changes of parameters and set-points at step boundaries."""
+"""Events: changes of parameters and set-points at step boundaries, at a time or when something happens."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from pgexcite.core.errors import Problem
+
+
+class When(BaseModel):
+    """A condition: a signal goes beyond a threshold and stays there. It is looked at after every step, and comes true once."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    signal: str = Field(description="path of an output: unit.G2.v_t, bus.HV.v, ...")
+    below: float | None = Field(None, description="threshold it goes below")
+    above: float | None = Field(None, description="threshold it goes above")
+    lasting: float = Field(0.0, ge=0, description="s for which it must stay there")
+    after: float = Field(0.0, ge=0, description="time from which on it is looked at, s")
+
+    @property
+    def threshold(self) -> float:
+        """The threshold, whichever it is."""
+        return float(self.above or 0.0) if self.below is None else self.below
+
+    def __str__(self) -> str:
+        beyond = f"above {self.threshold:g}" if self.below is None else f"below {self.threshold:g}"
+        return f"{self.signal} {beyond}" + (f" for {self.lasting:g} s" if self.lasting else "")
 
 
 @dataclass(frozen=True)
@@ -22,12 +43,14 @@ class Change:
         values: parameter or set-point path -> new value.
         increments: path -> what is added to the present value.
         text: for the log.
+        when: what it waits for; ``t`` then counts from the instant that comes true.
     """
 
     t: float
     values: Mapping[str, float]
     text: str
     increments: Mapping[str, float] | None = None
+    when: When | None = None
 
 
 def boundary(t: float, h: float) -> int:
@@ -38,14 +61,23 @@ def boundary(t: float, h: float) -> int:
 class _Event(BaseModel, ABC):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    t: float = Field(ge=0, description="time, s")
+    t: float | None = Field(None, ge=0, description="time, s; with when: s after that came true, 0 where left out")
+    when: When | None = Field(None, description="condition it waits for")
 
-    @abstractmethod
     def changes(self) -> tuple[Change, ...]:
         """What happens, as plain changes."""
+        return tuple(replace(change, when=self.when) for change in self._changes(self.t or 0.0))
+
+    @abstractmethod
+    def _changes(self, t: float) -> tuple[Change, ...]:
+        """What happens from ``t`` on."""
 
     def problems(self, where: str) -> list[Problem]:
         """What is wrong with this event by itself, each with its path below ``where``."""
+        if self.when is None:
+            return [] if self.t is not None else [Problem(f"{where}.t", "is required: time, s", hint="or give when")]
+        if (self.when.below is None) == (self.when.above is None):
+            return [Problem(f"{where}.when", "exactly one of below and above is needed")]
         return []
 
 
@@ -58,13 +90,13 @@ class Fault(_Event):
     X: float = Field(0.0, ge=0, description="fault reactance, pu of the system base")
     duration: float | None = Field(None, gt=0, description="s until the fault clears; never, where left out")
 
-    def changes(self) -> tuple[Change, ...]:
+    def _changes(self, t: float) -> tuple[Change, ...]:
         at = f"bus.{self.bus}."
         on = {at + "fault_status": 1.0, at + "fault_R": self.R, at + "fault_X": self.X}
-        begins = Change(self.t, on, f"three-phase fault at bus {self.bus} (R = {self.R:g}, X = {self.X:g} pu)")
+        begins = Change(t, on, f"three-phase fault at bus {self.bus} (R = {self.R:g}, X = {self.X:g} pu)")
         if self.duration is None:
             return (begins,)
-        return begins, Change(self.t + self.duration, {at + "fault_status": 0.0}, f"fault at bus {self.bus} cleared")
+        return begins, Change(t + self.duration, {at + "fault_status": 0.0}, f"fault at bus {self.bus} cleared")
 
 
 class BranchTrip(_Event):
@@ -74,13 +106,13 @@ class BranchTrip(_Event):
     name: str
     reclose_after: float | None = Field(None, gt=0, description="s until it closes again")
 
-    def changes(self) -> tuple[Change, ...]:
+    def _changes(self, t: float) -> tuple[Change, ...]:
         kind = self.type.removesuffix("_trip")
         path = f"{kind}.{self.name}.status"
-        opens = Change(self.t, {path: 0.0}, f"{kind} {self.name} trips")
+        opens = Change(t, {path: 0.0}, f"{kind} {self.name} trips")
         if self.reclose_after is None:
             return (opens,)
-        return opens, Change(self.t + self.reclose_after, {path: 1.0}, f"{kind} {self.name} recloses")
+        return opens, Change(t + self.reclose_after, {path: 1.0}, f"{kind} {self.name} recloses")
 
 
 class BranchClose(_Event):
@@ -89,9 +121,9 @@ class BranchClose(_Event):
     type: Literal["line_close", "transformer_close"]
     name: str
 
-    def changes(self) -> tuple[Change, ...]:
+    def _changes(self, t: float) -> tuple[Change, ...]:
         kind = self.type.removesuffix("_close")
-        return (Change(self.t, {f"{kind}.{self.name}.status": 1.0}, f"{kind} {self.name} closes"),)
+        return (Change(t, {f"{kind}.{self.name}.status": 1.0}, f"{kind} {self.name} closes"),)
 
 
 class LoadStep(_Event):
@@ -102,10 +134,10 @@ class LoadStep(_Event):
     dP: float = Field(0.0, description="MW added")
     dQ: float = Field(0.0, description="Mvar added")
 
-    def changes(self) -> tuple[Change, ...]:
+    def _changes(self, t: float) -> tuple[Change, ...]:
         path = f"load.{self.load}."
         text = f"load {self.load} steps by {self.dP:+g} MW, {self.dQ:+g} Mvar"
-        return (Change(self.t, {}, text, {path + "P": self.dP, path + "Q": self.dQ}),)
+        return (Change(t, {}, text, {path + "P": self.dP, path + "Q": self.dQ}),)
 
 
 class ParameterStep(_Event):
@@ -116,15 +148,16 @@ class ParameterStep(_Event):
     value: float | None = None
     step: float | None = None
 
-    def changes(self) -> tuple[Change, ...]:
+    def _changes(self, t: float) -> tuple[Change, ...]:
         if self.step is not None:
-            return (Change(self.t, {}, f"{self.path} steps by {self.step:+g}", {self.path: self.step}),)
-        return (Change(self.t, {self.path: float(self.value or 0.0)}, f"{self.path} set to {self.value:g}"),)
+            return (Change(t, {}, f"{self.path} steps by {self.step:+g}", {self.path: self.step}),)
+        return (Change(t, {self.path: float(self.value or 0.0)}, f"{self.path} set to {self.value:g}"),)
 
     def problems(self, where: str) -> list[Problem]:
+        found = super().problems(where)
         if (self.value is None) == (self.step is None):
-            return [Problem(where, "exactly one of value and step is needed")]
-        return []
+            found.append(Problem(where, "exactly one of value and step is needed"))
+        return found
 
 
 class HandOver(_Event):
@@ -134,10 +167,10 @@ class HandOver(_Event):
     controller: str
     to: Literal["controller", "classical"]
 
-    def changes(self) -> tuple[Change, ...]:
+    def _changes(self, t: float) -> tuple[Change, ...]:
         active = {f"controller.{self.controller}.active": float(self.to == "controller")}
         whom = self.controller if self.to == "controller" else "the classical controller"
-        return (Change(self.t, active, f"control passes to {whom}"),)
+        return (Change(t, active, f"control passes to {whom}"),)
 
 
 Event = Annotated[

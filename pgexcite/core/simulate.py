@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from pgexcite.core.step import Kernel
 from pgexcite.core.synchronism import RotorAngles, dead_buses
 from pgexcite.core.system import System
 from pgexcite.core.trace import Ending, LogEntry, Outcome, Trace
+from pgexcite.core.triggers import Triggers
 from pgexcite.core.undervoltage import Undervoltage
 
 Array = NDArray[np.float64]
@@ -117,8 +118,11 @@ class Simulation:
     def restart(self, changes: Sequence[Change] | None = None) -> None:
         """Go back to the initial point, with other events where they are given; nothing is compiled again."""
         if changes is not None:
-            self._changes = sorted(changes, key=lambda change: change.t)
-            self._check_changes()
+            self._check_changes(changes)
+            self._declared = tuple(changes)
+        self._changes = _in_order(change for change in self._declared if change.when is None)
+        waiting = [change for change in self._declared if change.when is not None]
+        self._triggers = Triggers(self.model, waiting, self.settings.h)
         self.state: State = self.initial.state
         self.p: Array = self.initial.p.copy()
         self.outcome: Outcome | None = None
@@ -234,17 +238,20 @@ class Simulation:
         t: Array = np.arange(before.k + 1, before.k + 1 + done, dtype=np.float64) * self.settings.h
         self._angles.follow(self.p)
         lost = self._angles.first_beyond(segment.x, segment.y, self.settings.delta_max_deg)
-        low = self._low.watch(segment.y)
-        rows = [found[0] + 1 for found in (lost, low) if found is not None]
-        keep = min(rows, default=done)
+        cuts = [found + 1 for found in (lost and lost[0], self._triggers.first(t, segment.y)) if found is not None]
+        keep = min([done, *cuts])
+        low = self._low.watch(segment.y[:keep])
+        keep = keep if low is None else low[0] + 1
         self._recording.add(t[:keep], segment.x[:keep], segment.z[:keep], segment.d[:keep], before.u, segment.y[:keep])
         if segment.rescued:
             text = f"{segment.rescued} steps up to t = {segment.state.t:g} s needed shorter inner steps or pivoting"
             self._recording.log.append(LogEntry(segment.state.t, "solver", text))
         self.state = segment.state
-        if rows:
+        if keep < done:
             row = keep - 1
             self.state = State(before.k + keep, float(t[row]), segment.x[row], segment.z[row], segment.d[row], before.u)
+        if fired := self._triggers.take(t[:keep], segment.y[:keep]):
+            self._changes, self._pending = _in_order([*self._changes, *fired]), _in_order([*self._pending, *fired])
         if lost is not None and lost[0] == keep - 1:
             _, unit, angle = lost
             text = f"its rotor angle against {self._angles.reference(unit)} reached {angle:.1f} degrees"
@@ -254,14 +261,17 @@ class Simulation:
             text = f"at t = {self.state.t:.4f} s: {voltage:.3f} pu"
             text += f", below {self.settings.collapse_below:g} pu for {self.settings.collapse_after:g} s"
             self._end(collapse(self.model, self.state, bus, text))
-        elif segment.failed:
+        elif segment.failed and keep == done:
             self._end(diagnose(self.kernel, self.state, self.p, self.settings.rule, self.settings.h, self._healthy))
 
     # Events.
 
-    def _check_changes(self) -> None:
+    def _check_changes(self, changes: Sequence[Change]) -> None:
         problems = []
-        for change in self._changes:
+        for change in changes:
+            if change.when is not None and change.when.signal not in self.model.index["y"]:
+                near = _nearest(self.model, change.when.signal)
+                problems.append(Problem(change.when.signal, f"no such output ({change.text} waits for it)", hint=near))
             for path in (*change.values, *(change.increments or {})):
                 known = path in self.model.index["u"] or path in self.model.index["p"]
                 if not known and _switched(path) not in self._controllers:
@@ -452,6 +462,7 @@ class Simulation:
             memory[f"instruments:{name}"] = r.instruments.memory()
             memory[f"active:{name}"] = np.array(float(r.active))
         memory["low"] = self._low.elapsed
+        memory |= {"triggers:elapsed": self._triggers.elapsed, "triggers:fired": self._triggers.fired}
         here = sum(self._boundary(change) == self.state.k for change in self._changes)
         memory["applied_here"] = np.array(
             here - sum(self._boundary(change) == self.state.k for change in self._pending)
@@ -474,12 +485,18 @@ class Simulation:
             running.session.recall(own)
             running.instruments.recall(memory[f"instruments:{name}"])
             running.active = bool(memory[f"active:{name}"] > 0)
+        self._triggers.elapsed, self._triggers.fired = memory["triggers:elapsed"], memory["triggers:fired"]
+        self._changes = _in_order([*self._changes, *self._triggers.past()])
         here = [change for change in self._changes if self._boundary(change) == self.state.k]
         later = [change for change in self._changes if self._boundary(change) > self.state.k]
         self._pending = here[int(memory["applied_here"]) :] + later
         self._low.elapsed = memory["low"].copy()
         self._recording = _Recording()
         self._record_point()
+
+
+def _in_order(changes: Iterable[Change]) -> list[Change]:
+    return sorted(changes, key=lambda change: change.t)
 
 
 def _switched(path: str) -> str:

@@ -95,18 +95,17 @@ class _Search:
     """Runs of one model that differ in when the fault clears, counted in steps."""
 
     def __init__(self, scenario: Scenario, h: float) -> None:
-        begins = [
-            c for c in scenario.changes if any(p.endswith(".fault_status") and v == 1 for p, v in c.values.items())
-        ]
+        timed = [change for change in scenario.changes if change.when is None]
+        begins = [c for c in timed if any(p.endswith(".fault_status") and v == 1 for p, v in c.values.items())]
         if len(begins) != 1:
             raise PgexciteError(
                 f"{scenario.path}: a critical clearing time needs exactly one fault among the events, not {len(begins)}"
             )
         self.begin = begins[0]
         self._path = next(path for path in self.begin.values if path.endswith(".fault_status"))
-        clearing = [change for change in scenario.changes if change.values.get(self._path) == 0]
+        clearing = [change for change in timed if change.values.get(self._path) == 0]
         t_clear = clearing[0].t if clearing else self.begin.t + _FIRST_GUESS
-        self._moving = [c for c in scenario.changes if clearing and abs(c.t - t_clear) < 1e-9] or [
+        self._moving = [c for c in timed if clearing and abs(c.t - t_clear) < 1e-9] or [
             Change(t_clear, {self._path: 0.0}, "fault cleared")
         ]
         self._fixed = [change for change in scenario.changes if change not in self._moving]

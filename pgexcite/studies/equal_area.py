@@ -198,7 +198,7 @@ def _pair(system: System) -> tuple[Device, Device]:
 
 def _stages(changes: Sequence[Change]) -> tuple[tuple[Change, ...], tuple[Change, ...], float | None]:
     """Changes at the fault, changes at its clearing (both without what follows), and the time between."""
-    ordered = sorted(changes, key=lambda change: change.t)
+    ordered = sorted((change for change in changes if change.when is None), key=lambda change: change.t)
     begins = [c.t for c in ordered if any(p.endswith(".fault_status") and v > 0 for p, v in c.values.items())]
     ends = [c.t for c in ordered if any(p.endswith(".fault_status") and v == 0 for p, v in c.values.items())]
     if len(begins) != 1:

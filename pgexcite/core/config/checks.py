@@ -104,18 +104,18 @@ def check_ends(events: Mapping[int, BaseModel], h: float | None, collect: Collec
     for number, event in events.items():
         if not isinstance(event, Fault | BranchTrip):
             continue
-        key = "duration" if isinstance(event, Fault) else "reclose_after"
+        key, begin = "duration" if isinstance(event, Fault) else "reclose_after", event.t or 0.0
         lasts = getattr(event, key)
-        end = math.inf if lasts is None else event.t + lasts
-        if lasts is not None and h is not None and boundary(end, h) <= boundary(event.t, h):
+        end = math.inf if lasts is None else begin + lasts
+        if lasts is not None and h is not None and boundary(end, h) <= boundary(begin, h):
             collect.add(
                 f"event.{number}.{key}",
                 f"ends on the step boundary it begins on: events move to the next whole step of simulation.h = {h:g} s",
                 lasts,
                 "make it longer or simulation.h shorter",
             )
-        if isinstance(event, Fault):
-            faults.setdefault(event.bus, []).append((event.t, end, number))
+        if isinstance(event, Fault) and event.when is None:
+            faults.setdefault(event.bus, []).append((begin, end, number))
     for bus, there in faults.items():
         there.sort()
         for (_, end, first), (begin, _, second) in pairwise(there):
