@@ -51,19 +51,18 @@ def cache_directory() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "pgexcite"
 
 
-def generate(functions: Sequence[ca.Function], constants: Mapping[str, object], *, rollout: bool = False) -> str:
-    """C source of these functions and of the stepping loop around them.
+def generate(functions: Sequence[ca.Function], constants: Mapping[str, object], loops: Sequence[str]) -> str:
+    """C source of these functions and of loops around them.
 
     Args:
-        functions: ``newton``, ``history``, ``update``, ``outputs``; for a rollout also ``stage_sensitivity``,
-            ``history_sensitivity`` and ``output_sensitivity``.
-        constants: what the templates need.
-        rollout: whether to add the prediction loop.
+        functions: what the loops call.
+        constants: what the loops need to know.
+        loops: files of ``c``, in order: ``step.c`` and ``advance.c`` take steps (``newton``, ``history``, ``update``; ``outputs``),
+            ``rollout.c`` and ``chain.c`` predict (the three of ``pgexcite.core.prediction.write_sensitivities``).
     """
     sizes = {key: max(1, *(getattr(f, key)() for f in functions)) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}
     values = {"pgexcite_public": "", **constants, **sizes}
-    loops = [loop("step.c"), loop("rollout.c")] if rollout else [loop("step.c")]
-    return "\n".join([write_functions(functions), define(values), *loops])
+    return "\n".join([write_functions(functions), define(values), *(loop(name) for name in loops)])
 
 
 def define(constants: Mapping[str, object]) -> str:

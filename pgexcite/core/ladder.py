@@ -31,9 +31,9 @@ Array = NDArray[np.float64]
 _MOVE_SLACK = 1e-6
 """By how much a move may exceed its bound: the tolerance of the quadratic program."""
 
-_PLAUSIBLE = 1e3
+PLAUSIBLE = 1e3
 """Largest measured value that is believed, pu."""
-_MOVED = 1e-6
+MOVED = 1e-6
 """A command that moved by more than this moves what is measured."""
 
 
@@ -187,7 +187,7 @@ class Ladder:
         values = np.array(list(sample.measured.values()))
         lost = not np.isfinite(values).all()
         # On standby the command stays where it is: a measurement once found to hang hangs until it moves.
-        moved = self._stale > 0 or bool(np.abs(self._move).max() > _MOVED)
+        moved = self._stale > 0 or bool(np.abs(self._move).max() > MOVED)
         hangs = moved and np.array_equal(values, self._seen)
         self._seen = values
         self._stale = self._stale + 1 if lost or hangs else 0
@@ -291,5 +291,5 @@ class Ladder:
 
 def _believed(sample: Sample) -> Sample:
     """A sample with NaN in place of what no instrument of a machine would show."""
-    measured = {path: value if abs(value) <= _PLAUSIBLE else np.nan for path, value in sample.measured.items()}
+    measured = {path: value if abs(value) <= PLAUSIBLE else np.nan for path, value in sample.measured.items()}
     return replace(sample, measured=measured)

@@ -153,9 +153,9 @@ class Predictor:
         if not self._kernel.compiled or functions.newton is None:
             return None
         sizes = {"n_commands": self._commands.size, "n_columns": columns, "n_selected": self._outputs.size}
-        loop = [functions.newton, functions.history, functions.update, functions.outputs]
+        called = [functions.newton, functions.history, functions.update, *self._functions]
         constants = self._kernel.constants() | sizes | {"transition": int(self.transitions)}
-        library = build(generate([*loop, *self._functions], constants, rollout=True))
+        library = build(generate(called, constants, ["step.c", "rollout.c", "chain.c"]))
         return None if library is None else load(library)
 
     def roll(self, state: State, moves: Array, horizon: Horizon, *, derivatives: bool) -> Rollout | None:

@@ -142,7 +142,8 @@ class Kernel:
         functions = self.functions
         if choice == "never" or functions.newton is None or (choice in ("auto", "wait") and compiler() is None):
             return None
-        source = generate([functions.newton, functions.history, functions.update, functions.outputs], self.constants())
+        called = [functions.newton, functions.history, functions.update, functions.outputs]
+        source = generate(called, self.constants(), ["step.c", "advance.c"])
         try:
             library = build(source, only_cached=choice == "auto" and functions.entries > COMPILED_BY_DEFAULT)
         except CompilationError:

@@ -28,7 +28,8 @@ enum {
     ${NAME}_ITERATED = 1,
     ${NAME}_PREDICTION_FAILED = 2,
     ${NAME}_STATE_UNKNOWN = 3,
-    ${NAME}_QP_FAILED = 4
+    ${NAME}_QP_FAILED = 4,
+    ${NAME}_STALE = 5 /* found, on a measurement too old to be used */
 };
 
 typedef struct {

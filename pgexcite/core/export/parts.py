@@ -50,8 +50,8 @@ class Parts:
             controller is in charge) among them.
         record: values of the inputs, one after the other, from a sample and the commands in force.
         condensed: the quadratic program.
-        functions: generated functions of the model: ``newton``, ``history``, ``update``, ``outputs``, and for a rollout those of
-            ``pgexcite.core.prediction.write_sensitivities``.
+        functions: generated functions of the model, no more than are called.
+        loops: files of ``core/c`` around them; see ``pgexcite.core.codegen.generate``.
         constants: what the templates are to know, by name; written as macros in capitals.
         arrays: constant arrays, by name.
         templates: text that goes below ``ladder.c``, in order; the last one has the public functions. ``${name}`` and
@@ -64,6 +64,7 @@ class Parts:
     record: Callable[[Sample, Array], Sequence[Array | float]]
     condensed: Condensed
     functions: Sequence[ca.Function]
+    loops: Sequence[str]
     constants: Mapping[str, object]
     arrays: Mapping[str, NDArray[np.float64] | NDArray[np.int32]]
     templates: Sequence[str]
@@ -74,11 +75,12 @@ class Parts:
 class Exportable(Protocol):
     """A solver that can be written as C."""
 
-    def parts(self, where: str) -> Parts:
+    def parts(self, where: str, measured: Sequence[str]) -> Parts:
         """Its parts.
 
         Args:
             where: path of the controller in the configuration, for messages.
+            measured: paths of what the controller measures, in the order in which a sample has them.
 
         Raises:
             ConfigError: something in its configuration cannot be exported.

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pgexcite.core.condensed import Condensed
 from pgexcite.core.errors import Problem
-from pgexcite.core.ladder import Ladder
+from pgexcite.core.ladder import MOVED, PLAUSIBLE, Ladder
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.float64] | NDArray[np.int32]
@@ -59,10 +59,15 @@ def program(condensed: Condensed) -> tuple[dict[str, object], dict[str, Numbers]
     return constants, arrays
 
 
-def ladder(session: Ladder) -> tuple[dict[str, object], dict[str, Numbers]]:
-    """Constants and arrays of the ladder."""
+def ladder(session: Ladder, measured: int) -> tuple[dict[str, object], dict[str, Numbers]]:
+    """Constants and arrays of the ladder; ``measured`` is the number of signals looked at for their age."""
     constants: dict[str, object] = {
+        "n_measured": 0 if session.options.perfect else measured,
         "max_reuse": session.options.max_reuse,
+        "max_age": session.options.max_age,
         "has_classical": int(session.actuator.has_classical),
+        "delayed": int(session.problem.delayed),
+        "plausible": PLAUSIBLE,
+        "moved_command": MOVED,
     }
     return constants, {"U_0": session.u_0}

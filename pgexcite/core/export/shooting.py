@@ -10,6 +10,7 @@ from pgexcite.core.codegen import loop
 from pgexcite.core.controller import Sample
 from pgexcite.core.errors import ConfigError, Problem
 from pgexcite.core.export import shared
+from pgexcite.core.export.horizon import horizon
 from pgexcite.core.export.parts import Input, Parts
 from pgexcite.core.prediction import write_sensitivities
 from pgexcite.core.shooting import DECREASE, SHORTEST, Shooting
@@ -61,6 +62,7 @@ def nmpc_parts(shooting: Shooting, where: str) -> Parts:
         record=_record,
         condensed=shooting.condensed,
         functions=functions,
+        loops=("step.c", "advance.c", "rollout.c", "chain.c"),
         constants=constants,
         arrays=arrays,
         templates=tuple(loop(file) for file in ("horizon.c", "shooting.c", "nmpc.c")),
@@ -101,19 +103,16 @@ def planning(shooting: Shooting) -> tuple[list[ca.Function], dict[str, object], 
     # What was prepared is corrected for the state.
     transitions = shooting.predictor.transitions or not converge
     columns = len(model.x_names) + commands.size if transitions else problem.N_c * commands.size
-    fixed = {model.position("u", path): value for path, value in problem.fixed.items()}
-    others = [k for k in range(len(model.u_names)) if k not in fixed and k not in commands]
-    known_constants, known_arrays = _known(shooting)
+    owned = {*problem.commands, *problem.fixed}
+    others = [k for k, path in enumerate(model.u_names) if path not in owned]
+    horizon_constants, horizon_arrays = horizon(shooting.horizons)
     constants: dict[str, object] = {
         "n_commands": commands.size,
         "n_columns": columns,
         "n_selected": outputs.size,
         "transition": int(transitions),
-        "first_count": max(1, round(problem.dt / shooting.horizons.h)),
         "rule": RULES.index(shooting.rule),
-        "n_fixed": len(fixed),
         "n_others": len(others),
-        "delayed": int(problem.delayed),
         "converge": int(converge),
         "jump": options.jump,
         "plan_tolerance": options.tolerance,
@@ -125,37 +124,8 @@ def planning(shooting: Shooting) -> tuple[list[ca.Function], dict[str, object], 
     arrays: dict[str, Numbers] = {
         "COMMANDS": commands,
         "OTHERS": np.array(others, dtype=np.int32),
-        "INTERVALS": problem.intervals(),
-        "SAMPLE_MOVE": problem.moves_per_sample(),
-        "FIXED_AT": np.array(list(fixed), dtype=np.int32),
-        "FIXED_TO": np.array(list(fixed.values()), dtype=float),
     }
     sensitivities = write_sensitivities(kernel, commands, outputs, columns)
     assert functions.newton is not None
     loops = [functions.newton, functions.history, functions.update, functions.outputs, *sensitivities]
-    return loops, kernel.constants() | constants | known_constants, arrays | known_arrays
-
-
-def _known(shooting: Shooting) -> tuple[dict[str, object], dict[str, Numbers]]:
-    """Known changes to come as assignments to elements of ``u`` and ``p``; what the model does not have is left out."""
-    index, horizons, known = shooting.kernel.model.index, shooting.horizons, shooting.problem.known
-    begins, assignments = [0], []
-    for change in known:
-        for values, add in ((change.values, 0.0), (change.increments or {}, 1.0)):
-            assignments += [
-                (float(group == "p"), float(index[group][path]), add, value)
-                for path, value in values.items()
-                for group in ("u", "p")
-                if path in index[group]
-            ]
-        begins.append(len(assignments))
-    table = np.array(assignments, dtype=float).reshape(-1, 4)
-    arrays: dict[str, Numbers] = {
-        "KNOWN_T": np.array([horizons.instant(change) for change in known], dtype=float),
-        "KNOWN_FROM": np.array(begins, dtype=np.int32),
-        "SET_P": table[:, 0].astype(np.int32),
-        "SET_AT": table[:, 1].astype(np.int32),
-        "SET_ADD": table[:, 2],
-        "SET_VALUE": table[:, 3],
-    }
-    return {"n_known": len(known)}, arrays
+    return loops, kernel.constants() | constants | horizon_constants, arrays | horizon_arrays

@@ -55,9 +55,10 @@ def export_c(scenario: Scenario, directory: Path, controller: str = "") -> Expor
     session = simulation.sessions[name]
     if not isinstance(session, Ladder) or not isinstance(session.solver, Exportable):
         raise ConfigError([Problem(f"controller.{name}", "cannot be exported: its backend offers no C")])
-    parts = session.solver.parts(f"controller.{name}")
+    measured = scenario.controllers[name].measures()
+    parts = session.solver.parts(f"controller.{name}", measured)
     prefix = re.sub(r"\W", "_", name)
-    files = _files(prefix, scenario, session, parts)
+    files = _files(prefix, scenario, session, parts, len(measured))
     _ensure_ours(directory, [*files, "replay.txt"])
     recorder = Recorder(session, parts)
     simulation.run()
@@ -87,7 +88,7 @@ def _ensure_ours(directory: Path, files: Sequence[str]) -> None:
             )
 
 
-def _files(name: str, scenario: Scenario, session: Ladder, parts: Parts) -> dict[str, str]:
+def _files(name: str, scenario: Scenario, session: Ladder, parts: Parts, measured: int) -> dict[str, str]:
     commands = session.problem.commands
     words: dict[str, object] = {
         "name": name,
@@ -109,17 +110,17 @@ def _files(name: str, scenario: Scenario, session: Ladder, parts: Parts) -> dict
     below = [filled(template) for template in (*shared_loops, *parts.templates)]
     return {
         f"{name}.h": filled(loop("controller.h")),
-        f"{name}.c": "\n".join([f'#include "{name}.h"\n', _model(session, parts), *below]),
+        f"{name}.c": "\n".join([f'#include "{name}.h"\n', _model(session, parts, measured), *below]),
         f"{name}_replay.c": filled(loop("replay.c")),
         "CMakeLists.txt": filled(loop("CMakeLists.txt")),
     }
 
 
-def _model(session: Ladder, parts: Parts) -> str:
+def _model(session: Ladder, parts: Parts, measured: int) -> str:
     """The functions of the model, the loops around them, and all numbers."""
     constants, arrays = shared.program(parts.condensed)
-    of_ladder, start = shared.ladder(session)
+    of_ladder, start = shared.ladder(session, measured)
     defined = {"pgexcite_public": "static", **constants, **of_ladder, **parts.constants}
-    loops = generate(parts.functions, defined, rollout=True)
+    loops = generate(parts.functions, defined, parts.loops)
     numbers = {**arrays, **start, **parts.arrays}
     return "\n".join([loops, *(array(name, values.ravel()) for name, values in numbers.items())]) + "\n"

@@ -7,7 +7,7 @@ discrete-time plant.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -110,7 +110,7 @@ class _Perfect(Shooting):
             self.p[list(self._wrong)] = list(self._wrong.values())
         return sample.state
 
-    def parts(self, where: str) -> Parts:
+    def parts(self, where: str, measured: Sequence[str]) -> Parts:
         """Its C; see ``pgexcite.core.export``."""
         if self._wrong:
             raise ConfigError(
