@@ -7,6 +7,7 @@ import numpy as np
 from pgexcite.core.component import Component
 from pgexcite.core.mpc import Problem
 from pgexcite.core.network import Bus, Line, Transformer
+from pgexcite.core.simulate import Simulation
 from pgexcite.core.system import Device, Schedule, System
 from pgexcite.plugins.exciters.constant import ConstantField
 from pgexcite.plugins.exciters.sexs import SEXS
@@ -79,6 +80,15 @@ def two_units(
         devices=tuple(devices),
         reference=reference,
     )
+
+
+def push(simulation: Simulation, state: str, by: float) -> None:
+    """Move one state of a simulation; the algebraic unknowns follow."""
+    x = simulation.state.x.copy()
+    x[simulation.model.position("x", state)] += by
+    settled = simulation.kernel.settle(simulation.state.with_(x=x), simulation.p)
+    assert settled is not None
+    simulation.state = settled
 
 
 def voltage_problem(command: str, **changes: object) -> Problem:

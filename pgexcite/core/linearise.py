@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,19 +75,35 @@ class Linearisation:
         if not self.x_names:
             return []
         values, right = np.linalg.eig(self.A)
-        left = np.linalg.pinv(right)
-        modes = []
-        for k in np.lexsort((-values.imag, -values.real)):
-            value = complex(values[k])
-            if value.imag < 0:
-                continue
-            factors = np.abs(right[:, k] * left[k, :])
-            factors = factors / factors.sum()
-            order = np.argsort(-factors, kind="stable")
-            share = {self.x_names[i]: float(factors[i]) for i in order}
-            size = abs(value)
-            modes.append(Mode(value, -value.real / size if size > 0 else 1.0, value.imag / (2 * np.pi), share))
-        return modes
+        return modes_of(values, np.linalg.pinv(right), right, self.x_names)
+
+
+def modes_of(
+    values: NDArray[np.complexfloating],
+    left: NDArray[np.complexfloating],
+    right: NDArray[np.complexfloating],
+    names: Sequence[str],
+) -> list[Mode]:
+    """Modes from eigenvalues and eigenvectors, real part descending; of a complex pair the one with positive frequency.
+
+    Args:
+        values: eigenvalues in continuous time, 1/s, shape ``(m,)``.
+        left: left eigenvectors, in rows, shape ``(m, n)``.
+        right: right eigenvectors, in columns, shape ``(n, m)``.
+        names: paths of the states.
+    """
+    modes = []
+    for k in np.lexsort((-values.imag, -values.real)):
+        value = complex(values[k])
+        if value.imag < 0:
+            continue
+        factors = np.abs(right[:, k] * left[k, :])
+        factors = factors / factors.sum()
+        order = np.argsort(-factors, kind="stable")
+        share = {names[i]: float(factors[i]) for i in order}
+        size = abs(value)
+        modes.append(Mode(value, -value.real / size if size > 0 else 1.0, value.imag / (2 * np.pi), share))
+    return modes
 
 
 def linearise(model: Model, state: State, p: Array) -> Linearisation:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import kobbelv
+from plants import kobbelv, push
 
 from pgexcite.core.errors import PgexciteError
 from pgexcite.core.linearise import linearise
@@ -44,9 +44,7 @@ def test_noise_moves_them_little():
 def test_a_small_swing_has_the_linearised_mode():
     sim = Simulation(kobbelv(), Settings(6.0, 0.005, "tr_bdf2", "never"))
     expected = next(m for m in linearise(sim.model, sim.state, sim.p).modes() if m.eigenvalue.imag > 1)
-    x = sim.state.x.copy()
-    x[sim.model.position("x", "unit.G2.machine.delta")] += 1e-4
-    sim.state = sim.kernel.settle(sim.state.with_(x=x), sim.p)
+    push(sim, "unit.G2.machine.delta", 1e-4)
     sim.run()
     trace = sim.trace()
     t = np.arange(0.5, 5.5, 0.02)

@@ -1,0 +1,155 @@
+"""The map over a sample against closed forms, and against the swings of the very loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from plants import kobbelv, push, regulated
+
+from pgexcite.core.controller import Action
+from pgexcite.core.errors import PgexciteError
+from pgexcite.core.linearise import linearise
+from pgexcite.core.measurement import Measurement
+from pgexcite.core.settings import Settings
+from pgexcite.core.simulate import Simulation
+from pgexcite.core.stage import ALPHA, BETA, GAMMA
+from pgexcite.plugins.controllers.mpc import MPC
+from pgexcite.studies.ringdown import mode_near, ringdown_modes
+from pgexcite.studies.sampled_modes import sampled_modes
+
+H = 0.005
+
+
+def simulation(system=None, h=H, t_end=6.0, **controllers):
+    return Simulation(system or kobbelv(), Settings(t_end, h, "tr_bdf2", "never"), (), controllers)
+
+
+def linearised(sim):
+    return linearise(sim.model, sim.state, sim.p)
+
+
+def tr_bdf2(z):
+    """What a step of TR-BDF2 makes of ``x' = lambda x``, ``z = lambda h``."""
+    half = GAMMA * z / 2
+    return (ALPHA * (1 + half) / (1 - half) - BETA) / (1 - half)
+
+
+def distance(found, expected):
+    """Largest distance of one of ``expected`` from the nearest of ``found``."""
+    return max(np.abs(np.asarray(found) - value).min() for value in expected)
+
+
+@pytest.mark.parametrize("system", [kobbelv, regulated])
+def test_without_control_it_is_the_rule_of_the_steps(system):
+    """To rounding: ``mu = R(lambda h)^n`` for every eigenvalue of the linearised plant."""
+    sim = simulation(system())
+    exact = linearised(sim).eigenvalues()
+    loop = sampled_modes(sim, 0.1)
+    assert distance(loop.multipliers, tr_bdf2(exact * H) ** 20) < 1e-7  # measured 9e-10, 3e-9
+    swing = exact[np.argmax(exact.imag * (exact.imag < 15))]
+    found = [mode.eigenvalue for mode in loop.modes()]
+    assert distance(found, [swing]) < 2e-3  # measured 6e-4, 4e-4
+
+
+def test_it_tends_to_the_modes_of_continuous_time_with_the_step():
+    errors = []
+    for h in (0.01, 0.005, 0.0025):
+        sim = simulation(h=h)
+        swing = next(m for m in linearised(sim).modes() if m.eigenvalue.imag > 1)
+        nearest = min(sampled_modes(sim, 0.1).modes(), key=lambda m: abs(m.eigenvalue - swing.eigenvalue))
+        errors.append(abs(nearest.eigenvalue - swing.eigenvalue))
+        assert list(nearest.participation)[:2] == list(swing.participation)[:2]
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.05)
+    assert errors[1] / errors[2] == pytest.approx(4, rel=0.05)
+
+
+@dataclass(frozen=True)
+class _Integral:
+    """A sampled integral controller of the terminal voltage, as a controller and as its own session."""
+
+    gain: float
+    dt: float = 0.1
+    information: str = "measured"
+    measurement: Measurement = field(default_factory=Measurement)
+    active: bool = True
+
+    def measures(self):
+        return ("unit.G2.v_t",)
+
+    def start(self, surroundings, plant):
+        return _Integrating(self.gain, surroundings.u_0["unit.G2.exciter.e_fd_ref"], surroundings.y_0["unit.G2.v_t"])
+
+
+class _Integrating:
+    def __init__(self, gain, u, v_ref):
+        self.gain, self.u, self.v_ref = gain, u, v_ref
+
+    def act(self, sample):
+        self.u += self.gain * (self.v_ref - sample.measured["unit.G2.v_t"])
+        return Action({"unit.G2.exciter.e_fd_ref": float(self.u)})
+
+    def prepare(self):
+        pass
+
+    def memory(self):
+        return {"u": np.array(self.u), "v_ref": np.array(self.v_ref)}
+
+    def recall(self, memory):
+        self.u, self.v_ref = float(memory["u"]), float(memory["v_ref"])
+
+
+def test_a_sampled_controller_in_closed_form():
+    """``u+ = u - k C x``, ``x+ = Phi x + Gamma u+``, with ``Phi`` and ``Gamma`` of TR-BDF2's steps."""
+    gain = 2.0
+    sim = simulation(integral=_Integral(gain))
+    at = linearised(sim)
+    command, voltage = at.u_names.index("unit.G2.exciter.e_fd_ref"), at.y_names.index("unit.G2.v_t")
+    n = len(at.x_names)
+    whole = np.zeros((n + 1, n + 1))
+    whole[:n, :n], whole[:n, n] = at.A, at.B[:, command]
+    half = np.linalg.inv(np.eye(n + 1) - GAMMA * H / 2 * whole)
+    step = half @ (ALPHA * half @ (np.eye(n + 1) + GAMMA * H / 2 * whole) - BETA * np.eye(n + 1))
+    over = np.linalg.matrix_power(step, 20)
+    Phi, Gamma = over[:n, :n], over[:n, n:]
+    C, D = at.C[voltage : voltage + 1], at.D[voltage, command]
+    assert D == 0
+    closed = np.block([[Phi - gain * Gamma @ C, Gamma], [-gain * C, np.ones((1, 1))]])
+    loop = sampled_modes(sim, 0.1)
+    assert loop.names[-1] == "controller.integral.u.0"
+    assert distance(loop.multipliers, np.linalg.eigvals(closed)) < 1e-7  # measured 1.2e-9
+    assert loop.defect < 1e-9  # measured 7e-14
+
+
+@pytest.mark.parametrize(("backend", "options"), [("nmpc", {"tolerance": 1e-9}), ("linear", {"relinearise": "once"})])
+def test_predictive_control_swings_as_the_map_says(backend, options):
+    mpc = MPC(unit="G2", backend=backend, options=options, N_p=10, N_c=3, dt=0.1)
+    sim = simulation(mpc=mpc, t_end=20.0)
+    sim.run(until=10.0)
+    loop = sampled_modes(sim, 0.1)
+    swing = next(m for m in loop.modes() if 1.0 < m.frequency_hz < 2.0)
+    push(sim, "unit.G2.machine.delta", 1e-3)
+    sim.run()
+    trace = sim.trace()
+    t = np.arange(11.0, 17.0, 0.02)
+    found = mode_near(ringdown_modes(t, np.interp(t, trace.t, trace["unit.G2.delta"])), (1.0, 2.0))
+    assert found.eigenvalue == pytest.approx(swing.eigenvalue, abs=5e-4)  # measured 1.7e-5, 5e-5
+
+
+def test_it_leaves_the_simulation_where_it_was():
+    sim = simulation(mpc=MPC(unit="G2", backend="linear", options={"relinearise": "once"}))
+    sim.run(until=1.0)
+    before, memory = sim.state, sim.sessions["mpc"].memory()
+    sampled_modes(sim, 0.05)
+    assert sim.state is before
+    assert all(np.array_equal(memory[key], value) for key, value in sim.sessions["mpc"].memory().items())
+
+
+def test_what_is_no_sample_of_a_loop_at_rest_is_refused():
+    sim = simulation(integral=_Integral(2.0))
+    with pytest.raises(PgexciteError, match=r"multiples of the controllers' 0.1 s"):
+        sampled_modes(sim, 0.05)
+    push(sim, "unit.G2.machine.omega", 1e-3)
+    with pytest.raises(PgexciteError, match="not a point of rest"):
+        sampled_modes(sim, 0.1)
