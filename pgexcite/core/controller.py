@@ -27,9 +27,9 @@ class Surroundings:
         h: step of the simulation, s.
         rule: integration rule of the simulation.
         u_0: commands at the initial point, by path.
-        y_0: outputs at the initial point, by path.
+        y_0: outputs at the initial point, by path: those the controller measures; all of them with perfect information.
         system: the grid as configured, for controllers that build a model of their own from its nameplate data.
-        changes: the events of the run, for controllers that declare some of them known.
+        changes: the events of the run that have a time, for controllers that declare them known.
         compile: whether steps are compiled to C, for such models too.
     """
 
@@ -140,6 +140,11 @@ class Controller(Protocol):
     @property
     def active(self) -> bool:
         """Whether it is in charge from the start, or on standby."""
+        ...
+
+    @property
+    def disturbance_known(self) -> bool:
+        """Whether it is told the events of the run in advance."""
         ...
 
     def measures(self) -> Sequence[str]:

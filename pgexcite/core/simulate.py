@@ -360,21 +360,22 @@ class Simulation:
                     for path in missing
                 ]
             )
+        names, perfect = tuple(controller.measures()), controller.information == "perfect"
+        outputs = dict(zip(self.model.y_names, y, strict=True))
         surroundings = Surroundings(
             h=self.settings.h,
             rule=self.settings.rule,
             u_0=dict(zip(self.model.u_names, s.u, strict=True)),
-            y_0=dict(zip(self.model.y_names, y, strict=True)),
+            y_0=outputs if perfect else {path: outputs[path] for path in names if path in outputs},
             system=self.model.system,
-            changes=tuple(self._changes),
+            changes=tuple(self._changes) if controller.disturbance_known else (),
             compile=self.settings.compile,
         )
         plant = None
-        if controller.information == "perfect":
+        if perfect:
             plant = Plant(
                 self.model, Kernel(self.model, s, self.initial.p, self.settings.compile), self.initial.p.copy()
             )
-        names = tuple(controller.measures())
         # Outputs and commands in one row: a controller may read back the set-points it moves.
         setpoints = np.array([path in index["u"] for path in names], dtype=bool)
         n_y = len(self.model.y_names)

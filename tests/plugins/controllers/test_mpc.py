@@ -244,3 +244,23 @@ def test_a_feeder_that_is_dead_does_not_stop_the_predictions():
     assert sim.get("bus.SPUR.v") < 1e-9
     assert sim.result().controllers["mpc"].fallbacks == 0
     assert not [entry for entry in sim.trace().log if entry.kind == "solver"]
+
+
+class _Curious(MPC):
+    """Remembers what it was told before the run."""
+
+    def start(self, surroundings, plant):
+        type(self).told = surroundings, plant
+        return super().start(surroundings, plant)
+
+
+@pytest.mark.parametrize(("backend", "known"), [("nmpc", False), ("nmpc", True), ("linear", False), ("linear", True)])
+def test_before_the_run_a_controller_is_told_no_more_than_it_may_know(backend, known):
+    config = _Curious(unit="G2", backend=backend, disturbance_known=known)
+    sim = Simulation(kobbelv(), Settings(0.1, 0.005, "tr_bdf2", "never"), FAULT.changes(), {"mpc": config})
+    surroundings, plant = config.told
+    assert len(surroundings.changes) == (2 if known else 0)
+    perfect = backend == "nmpc"
+    assert (plant is not None) == perfect
+    assert set(surroundings.y_0) == set(sim.model.y_names if perfect else config.measures())
+    assert ("unit.G2.delta" in surroundings.y_0) == perfect
