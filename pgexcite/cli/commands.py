@@ -259,6 +259,7 @@ def equal_area(config: Path, overrides: tuple[str, ...], figure: Path | None, as
 )
 @click.option("--bus", help="Bus whose voltage is drawn [the weakest].")
 @click.option("--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw the curves into this file.")
+@click.option("--per-unit", is_flag=True, help="Powers in per unit of S_base instead of MW and Mvar.")
 @_json
 def pv(
     config: Path,
@@ -267,6 +268,7 @@ def pv(
     tangents: tuple[float, ...],
     bus: str | None,
     figure: Path | None,
+    per_unit: bool,
     as_json: bool,
 ) -> None:
     """P-V curve: loads scaled at constant power factor, through the nose.
@@ -289,11 +291,11 @@ def pv(
     if figure is not None:
         from pgexcite.studies.pv_figure import draw_pv
 
-        draw_pv(curves, shown, figure, scenario.title or config.stem)
+        draw_pv(curves, shown, figure, scenario.title or config.stem, per_unit=per_unit)
     if as_json:
         show.json({"curves": [{"label": label, **curve.as_dict()} for label, curve in curves]})
     else:
-        show.table([curve.row(label, shown) for label, curve in curves])
+        show.table([curve.row(label, shown, per_unit=per_unit) for label, curve in curves])
 
 
 @main.command(name="export-c")

@@ -20,6 +20,8 @@ _TOLERANCE = 1e-12
 _MAX_ITERATIONS = 8
 _LONGEST, _SHORTEST = 0.1, 1e-7
 """Arc length of a step: pu, rad and units of the scaling factor together."""
+_BEND = 0.05
+"""Largest distance of a point from the tangent before it, over the step: the curve turns by about twice this, rad, in a step."""
 _LOWEST_VOLTAGE = 0.05
 """Bus voltage, pu, at which the lower branch is left."""
 _MAX_POINTS = 3000
@@ -165,7 +167,7 @@ def trace(
     while len(points) < _MAX_POINTS and not stop(points[-1]):
         y = points[-1]
         there = problem.correct(y + step * tangent, tangent)
-        if there is None or np.linalg.norm(there - y - step * tangent) > 0.3 * step:
+        if there is None or np.linalg.norm(there - y - step * tangent) > _BEND * step:
             step /= 2
             if step < _SHORTEST:
                 raise ContinuationError(f"the curve could not be followed beyond a scaling factor of {y[-1]:.6g}")

@@ -27,6 +27,7 @@ class PVCurve:
         nose: position of the nose, whose point is exact.
         weakest: the bus whose voltage falls most at the nose.
         limited: ``(P in MW, path)`` of each unit that met its reactive limit on the way up from the base case.
+        S_base: base of powers in per unit, MVA.
     """
 
     loads: tuple[str, ...]
@@ -37,6 +38,7 @@ class PVCurve:
     nose: int
     weakest: str
     limited: tuple[tuple[float, str], ...]
+    S_base: float
 
     @property
     def P_max(self) -> float:
@@ -55,11 +57,12 @@ class PVCurve:
             "points": len(self.P),
         }
 
-    def row(self, label: str, bus: str) -> dict[str, Any]:
-        """The nose as a row of a table, with the voltage of one bus."""
+    def row(self, label: str, bus: str, *, per_unit: bool = False) -> dict[str, Any]:
+        """The nose as a row of a table, with the voltage of one bus; its power in MW or per unit of ``S_base``."""
+        power = {"P_max [pu]": self.P_max / self.S_base} if per_unit else {"P_max [MW]": self.P_max}
         return {
             "curve": label,
-            "P_max [MW]": self.P_max,
+            **power,
             "factor": float(self.factor[self.nose]),
             f"V at {bus} [pu]": float(self.V[bus][self.nose]),
             "weakest bus": self.weakest,
@@ -111,6 +114,7 @@ def pv_curve(system: System, loads: Sequence[str] = (), tan_phi: float | None = 
         sum(y[-1] >= 0.0 for y in down[1:]) + nose,
         weakest,
         tuple((P * factor, path) for factor, path in problem.limited),
+        system.S_base,
     )
 
 

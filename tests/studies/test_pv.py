@@ -116,6 +116,22 @@ def test_command_draws_curves_and_their_surface(tmp_path):
     assert all(content.startswith(b"\x89PNG") and len(content) > 20_000 for content in pictures)
 
 
+def test_command_in_per_unit(tmp_path):
+    options = ["--tan-phi", "0", "--per-unit", "--figure", str(tmp_path / "one.png")]
+    printed = CliRunner().invoke(main, ["pv", str(TWO_BUS), *options]).output
+    assert "P_max [pu]" in printed
+    assert "0.5 " in printed
+    assert (tmp_path / "one.png").stat().st_size > 20_000
+
+
+def test_the_curve_turns_by_little_from_point_to_point():
+    """What makes its picture smooth: less than 10 degrees between one chord and the next."""
+    curve = pv_curve(load(TWO_BUS).system)
+    chords = np.diff(curve.factor) + 1j * np.diff(curve.V["L"])
+    turns = np.abs(np.degrees(np.angle(chords[1:] / chords[:-1])))
+    assert turns.max() < 10.0  # measured 7.7
+
+
 def test_command_as_json_and_with_a_wrong_bus():
     import json
 
