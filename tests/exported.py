@@ -41,7 +41,7 @@ def symbols(directory: Path, name: str = "mpc") -> tuple[set[str], set[str]]:
     offered = {symbol for kind, symbol in parts if kind in "TDBC"}
     # "_GLOBAL_OFFSET_TABLE_" and the stack guard are the linker's.
     allowed = re.compile(
-        r"mem(cpy|set|move)|__stack_chk_fail|_GLOBAL_OFFSET_TABLE_|a?(sin|cos|tan)2?|sincos|sqrt|f(max|min|abs)|exp|log|pow"
+        r"mem(cpy|set|move)|__stack_chk_fail|_GLOBAL_OFFSET_TABLE_|a?(sin|cos|tan)2?|sincos|sqrt|hypot|f(max|min|abs)|exp|log|pow"
     )
     return offered, {symbol for kind, symbol in parts if kind == "U" and not allowed.fullmatch(symbol)}
 

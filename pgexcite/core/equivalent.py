@@ -178,6 +178,16 @@ class Equivalent:
         p[self._x_s] = estimate[layout.x_s]
         return x, u, p
 
+    def positions(self) -> dict[str, int]:
+        """Where ``point`` puts ``delta`` in ``x``, ``v_bus``, ``p_m`` and ``e_fd`` in ``u``, ``x_s`` in ``p``."""
+        places = {"delta": self._delta, "v_bus": self._v_bus, "p_m": self._p_m}
+        return places | {"e_fd": self._e_fd, "x_s": self._x_s}
+
+    @property
+    def rotor(self) -> tuple[int, ...]:
+        """Where in ``x`` it puts the rotor's states, in the order of ``layout.rotor``."""
+        return tuple(self._rotor)
+
     def functions(self, dt: float, steps: int) -> tuple[ca.Function, ca.Function]:
         """``propagate(xi, e_fd) -> xi`` over a sample and ``sense(xi, e_fd) -> TERMINALS``, of the vector ``Layout`` describes.
 

@@ -6,7 +6,7 @@
    Memory is static, nothing is allocated, iterations are capped. One instance to a program; not to be called from two threads. Do
    not compile with -ffast-math: not-a-number must be seen.
 
-$orders
+$orders$told_order
    Order of commands:
 $commands
 */
@@ -19,7 +19,7 @@ extern "C" {
 
 enum {
 $sizes
-    ${NAME}_N_COMMANDS = $n_commands
+$told_size    ${NAME}_N_COMMANDS = $n_commands
 };
 
 /* How a plan was found. The first two may be used. */
@@ -42,7 +42,7 @@ typedef struct {
                        should take over; it is for the caller to come back after some samples with a usable plan */
     int status;     /* how this plan was found */
     int iterations; /* quadratic programs solved */
-    double cost;    /* predicted cost of this plan */
+    double cost;    /* predicted cost of this plan */$outputs
 } ${name}_output;
 
 /* Forget everything. To be called once before the first sample. */

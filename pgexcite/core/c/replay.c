@@ -1,6 +1,7 @@
 /* Replays a recorded closed loop through the controller and compares its answers with the recorded ones.
 
-   Usage: ${name}_replay replay.txt; exit code 0 where all levels are the same and no command differs by more than the tolerance. */
+   Usage: ${name}_replay replay.txt; exit code 0 where all levels are the same and no command or estimate differs by
+   more than the tolerance. */
 
 #include <math.h>
 #include <stdio.h>
@@ -31,7 +32,9 @@ int main(int argc, char **argv) {
     static ${name}_input in;
     static ${name}_output out;
     const double tolerance = $tolerance;
-    double expected[$n_commands], sent[$n_commands], cost, difference = 0, cost_difference = 0;
+    const double *told = $told;
+    double expected[$n_commands], sent[$n_commands], expected_told[1 + $n_told];
+    double cost, difference = 0, cost_difference = 0, told_difference = 0;
     int samples = 0, level, iterations, other_levels = 0, other_iterations = 0, i;
     clock_t spent = 0, began;
     FILE *file = argc > 1 ? fopen(argv[1], "r") : NULL;
@@ -42,7 +45,8 @@ int main(int argc, char **argv) {
     ${name}_reset();
     while (read_input(file, &in)) {
         if (!read_int(file, &level, 1) || !read_double(file, expected, $n_commands) || !read_double(file, sent, $n_commands) ||
-            !read_double(file, &cost, 1) || !read_int(file, &iterations, 1)) {
+            !read_double(file, &cost, 1) || !read_int(file, &iterations, 1) ||
+            !read_double(file, expected_told, $n_told)) {
             fprintf(stderr, "sample %d of %s is incomplete\n", samples, argv[1]);
             return 2;
         }
@@ -54,6 +58,11 @@ int main(int argc, char **argv) {
             if (!(d <= difference)) difference = d;
         }
         if (cost < INFINITY && !(fabs(out.cost - cost) <= cost_difference)) cost_difference = fabs(out.cost - cost);
+        for (i = 0; i < $n_told; i++) {
+            double d = fabs(told[i] - expected_told[i]) / (1 + fabs(expected_told[i]));
+            int both_nothing = told[i] != told[i] && expected_told[i] != expected_told[i];
+            if (!both_nothing && !(d <= told_difference)) told_difference = d;
+        }
         other_levels += out.level != level;
         other_iterations += out.iterations != iterations;
         began = clock();
@@ -70,7 +79,8 @@ int main(int argc, char **argv) {
     printf("samples on another level %d\n", other_levels);
     printf("largest difference of a command %.3e\n", difference);
     printf("largest difference of a cost %.3e\n", cost_difference);
+    if ($n_told > 0) printf("largest difference of an estimate %.3e\n", told_difference);
     printf("samples with another number of iterations %d\n", other_iterations);
     printf("mean time of a sample %.3e s\n", (double)spent / CLOCKS_PER_SEC / (samples > 0 ? samples : 1));
-    return samples > 0 && other_levels == 0 && difference <= tolerance ? 0 : 1;
+    return samples > 0 && other_levels == 0 && difference <= tolerance && told_difference <= tolerance ? 0 : 1;
 }

@@ -56,7 +56,9 @@ class Parts:
         arrays: constant arrays, by name.
         templates: text that goes below ``ladder.c``, in order; the last one has the public functions. ``${name}`` and
             ``${NAME}`` stand for the controller's name.
-        tolerance: difference of a command, in its unit, up to which the replay agrees with Python.
+        tolerance: difference of a command, in its unit, and of what is told (relative where it is large), up to which the replay
+            agrees with Python.
+        told: names of numbers among a solution's diagnostics that the controller in C answers too, in its output's ``estimate``.
     """
 
     about: str
@@ -69,6 +71,7 @@ class Parts:
     arrays: Mapping[str, NDArray[np.float64] | NDArray[np.int32]]
     templates: Sequence[str]
     tolerance: float
+    told: Sequence[str] = ()
 
 
 @runtime_checkable

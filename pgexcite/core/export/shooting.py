@@ -25,6 +25,9 @@ TOLERANCE = 1e-6
 TOLERANCE_CONVERGED = 1e-4
 """Where ProxQP's rounding ends an iteration one program sooner or later than the exact solution: measured 3e-5 pu."""
 
+LOOPS = ("step.c", "advance.c", "rollout.c", "chain.c")
+"""What ``shooting.c`` goes below."""
+
 _ABOUT = """One predictive controller for one plant: plans on the plant's own step, from the plant's own state, as
    pgexcite.core.shooting makes them, and the checks of pgexcite.core.ladder."""
 DELAYED = """
@@ -40,7 +43,7 @@ def nmpc_parts(shooting: Shooting, where: str) -> Parts:
     Raises:
         ConfigError: something in the configuration cannot be exported.
     """
-    _refuse(where, shooting)
+    refuse(where, shooting)
     model, (functions, constants, arrays) = shooting.kernel.model, planning(shooting)
     names = {"x": model.x_names, "z": model.z_names, "d": model.d_names, "u": model.u_names, "p": model.p_names}
     about = {
@@ -62,7 +65,7 @@ def nmpc_parts(shooting: Shooting, where: str) -> Parts:
         record=_record,
         condensed=shooting.condensed,
         functions=functions,
-        loops=("step.c", "advance.c", "rollout.c", "chain.c"),
+        loops=LOOPS,
         constants=constants,
         arrays=arrays,
         templates=tuple(loop(file) for file in ("horizon.c", "shooting.c", "nmpc.c")),
@@ -77,8 +80,12 @@ def _record(sample: Sample, u_last: Array) -> list[Array | float]:
     return [sample.t, int(sample.active), state.startup, state.x, state.z, state.d, state.u, p, u_last]
 
 
-def _refuse(where: str, shooting: Shooting) -> None:
-    """Refuse what the exported controller does not do."""
+def refuse(where: str, shooting: Shooting) -> None:
+    """Refuse what the exported controller does not do.
+
+    Raises:
+        ConfigError: something in the configuration cannot be exported.
+    """
     unsupported = {
         "options.candidates": (shooting.options.candidates > 0, "candidate plans are not exported"),
         "rule": (

@@ -28,6 +28,19 @@ def input_words(name: str, inputs: Sequence[Input]) -> dict[str, str]:
     }
 
 
+def told_words(name: str, told: Sequence[str]) -> dict[str, str | int]:
+    """What they are to know of what it answers beside the command."""
+    if not told:
+        return {"told_order": "", "told_size": "", "outputs": "", "n_told": 0, "told": "NULL"}
+    return {
+        "told_order": f"   Order of estimate:\n{listed(told)}\n",
+        "told_size": f"    {name.upper()}_N_ESTIMATE = {len(told)},\n",
+        "outputs": f"\n    double estimate[{len(told)}]; /* what is believed, whether a plan was found or not */",
+        "n_told": len(told),
+        "told": "out.estimate",
+    }
+
+
 def _field(item: Input) -> str:
     dimension = "" if item.size is None else f"[{max(1, item.size)}]"
     return f"    {item.kind} {item.name}{dimension}; /* {comment(item.comment)} */"

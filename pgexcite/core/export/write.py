@@ -101,6 +101,7 @@ def _files(name: str, scenario: Scenario, session: Ladder, parts: Parts, measure
         "n_commands": len(commands),
         "commands": text.listed(commands),
         **text.input_words(name, parts.inputs),
+        **text.told_words(name, parts.told),
     }
 
     def filled(template: str) -> str:

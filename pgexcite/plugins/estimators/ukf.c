@@ -407,7 +407,7 @@ static void estimator_reset(void) {
 
 /* One sample further: terminals measured now, null where lost, and the field voltage since the last sample. Whether it is sound. */
 static int estimator_observe(const double *terminals, double e_fd) {
-    static Expectation expected;
+    static Expectation now;
     double surprise = NAN;
     int change = 0, sane;
     ukf_input = e_fd;
@@ -415,9 +415,9 @@ static int estimator_observe(const double *terminals, double e_fd) {
     if (sane) {
         ukf_started = 1;
         if (terminals != NULL) {
-            sane = ukf_judge(terminals, &expected, &surprise, &change);
-            if (sane) memcpy(ukf_seen, expected.z, sizeof ukf_seen);
-            if (sane && change >= 0) ukf_correct(&expected, terminals);
+            sane = ukf_judge(terminals, &now, &surprise, &change);
+            if (sane) memcpy(ukf_seen, now.z, sizeof ukf_seen);
+            if (sane && change >= 0) ukf_correct(&now, terminals);
         }
         sane = sane && ukf_is_sane();
     }

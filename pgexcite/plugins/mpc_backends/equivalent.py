@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from pgexcite.core.codegen import loop
 from pgexcite.core.controller import Plant, Sample, Surroundings, as_arrays
 from pgexcite.core.declare import par
 from pgexcite.core.equivalent import TERMINALS, Equivalent
 from pgexcite.core.errors import ConfigError, Problem, RegistryError
-from pgexcite.core.estimation import Estimate, Estimator, Observer
+from pgexcite.core.estimation import Estimate, Estimator, Observer, Writable
+from pgexcite.core.export import Input, Parts
+from pgexcite.core.export.shooting import DELAYED, LOOPS, planning, refuse
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solution, Solver
@@ -22,6 +26,10 @@ from pgexcite.core.registry import find
 from pgexcite.core.shooting import Shooting, ShootingOptions
 
 Array = NDArray[np.float64]
+
+_TEXT = Path(__file__).with_suffix(".c").read_text(encoding="utf-8")
+_ABOUT = """One predictive controller for one unit, from the unit's own terminals: plans as pgexcite.core.shooting makes them, on an
+   equivalent that an estimator keeps track of, and the checks of pgexcite.core.ladder. On standby it goes on estimating."""
 
 
 class EquivalentMPC(BaseModel):
@@ -87,6 +95,7 @@ class _Equivalent(Shooting):
         own = _translated(problem, self._equivalent)
         super().__init__(self._equivalent.kernel, own, shooting, rule="tr_bdf2", h=h, grid=surroundings.h)
         self._offset = self._equivalent.offset
+        self._bounds = float(problem.u_min[0]), float(problem.u_max[0])
         self._seen = self._sent = np.array([surroundings.y_0[self._field]])
         self._in_charge = False
         self._told: Mapping[str, float] = {}
@@ -140,6 +149,54 @@ class _Equivalent(Shooting):
         start = self._equivalent.initial.state
         x, u, self.p = self._equivalent.point(estimate.value, float(self._seen[0]) + self._offset)
         return self.kernel.settle(State(0, t, x, start.z, start.d, u), self.p)
+
+    # As C.
+
+    def parts(self, where: str, measured: Sequence[str]) -> Parts:
+        """Its C; see ``pgexcite.core.export``."""
+        refuse(where, self)
+        if not isinstance(self._observer, Writable):
+            raise ConfigError([Problem(f"{where}.options.estimator", "this estimator offers no C")])
+        estimator, (functions, constants, arrays) = self._observer.written(), planning(self)
+        seen = [*self._paths, self._field]
+        told = "measured at this instant, pu; NaN where lost"
+        return Parts(
+            about=_ABOUT + DELAYED * self.problem.delayed,
+            inputs=(
+                Input("t", "s, on the clock of the references"),
+                Input("active", "whether the controller is in charge", kind="int"),
+                Input.of("measured", told, seen),
+                Input("u_last", "command in force until the plan begins; on standby the field voltage", 1),
+            ),
+            record=lambda sample, u_last: [
+                sample.t,
+                int(sample.active),
+                np.array([sample.measured[path] for path in seen]),
+                u_last,
+            ],
+            condensed=self.condensed,
+            functions=(*functions, *estimator.functions),
+            loops=LOOPS,
+            constants={**constants, **estimator.constants, **self._constants(len(seen))},
+            arrays={**arrays, **estimator.arrays, **self._arrays()},
+            templates=(*(loop(file) for file in ("horizon.c", "shooting.c")), estimator.text, _TEXT),
+            tolerance=1e-6,  # measured 1e-12 to 1e-8
+            told=estimator.told,
+        )
+
+    def _constants(self, n_measured: int) -> dict[str, object]:
+        rotor, layout = self._equivalent.rotor, self._equivalent.layout
+        lower, upper = self._bounds
+        own: dict[str, object] = {"n_measured": n_measured, "n_rotor": len(rotor), "at_omega": rotor[layout.omega]}
+        numbers = {"offset": self._offset, "field_0": float(self._seen[0]), "plant_lower": lower, "plant_upper": upper}
+        return own | numbers | {f"at_{name}": k for name, k in self._equivalent.positions().items()}
+
+    def _arrays(self) -> dict[str, Any]:
+        initial = self._equivalent.initial
+        state = initial.state
+        start = {"X_0": state.x, "Z_0": state.z, "D_0": state.d, "U_START": state.u, "P_0": initial.p}
+        u_0 = state.u[[self._equivalent.positions()["e_fd"]]]
+        return start | {"U_0": u_0, "ROTOR": np.array(self._equivalent.rotor, dtype=np.int32)}
 
 
 def _translated(problem: ControlProblem, equivalent: Equivalent) -> ControlProblem:

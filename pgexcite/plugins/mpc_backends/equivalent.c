@@ -1,0 +1,73 @@
+/* NMPC on an estimated equivalent, from the unit's terminals: the backend "equivalent" (pgexcite.plugins.mpc_backends.equivalent).
+
+   Goes below shooting.c and an estimator. The equivalent's field voltage is OFFSET above the plant's: commands and bounds are the
+   equivalent's inside, the plant's outside. */
+
+/* The field voltage as last seen and as sent last, pu of the plant. */
+static double field_seen, field_sent;
+static int was_in_charge;
+
+/* The equivalent's field voltage since the last sample, of which `field` was measured at the end. */
+static double since_last(int whole, double field) {
+    double before = field_seen;
+    field_seen = whole ? field : field_sent;
+    /* In charge it was constant. A regulator moved it; its two ends are known. */
+    return (was_in_charge ? field_seen : (before + field_seen) / 2) + OFFSET;
+}
+
+/* Keep what is in force until the next sample. */
+static void send(const double *command) {
+    if (fabs(command[0]) <= PLAUSIBLE) field_sent = command[0];
+}
+
+/* The equivalent at the estimate; 0 where its equations have no solution there. */
+static int locate(Point *at, double *p) {
+    static double u[AT_LEAST_1(N_U)];
+    const double *bus = estimator_value + N_ROTOR + 3;
+    int i;
+    memcpy(at->x, X_0, sizeof(double) * N_X); memcpy(at->z, Z_0, sizeof(double) * N_Z);
+    memcpy(at->d, D_0, sizeof(double) * N_D); memcpy(u, U_START, sizeof(double) * N_U); memcpy(p, P_0, sizeof(double) * N_P);
+    for (i = 0; i < N_ROTOR; i++) at->x[ROTOR[i]] = estimator_value[i];
+    at->x[AT_OMEGA] -= estimator_value[N_ROTOR + 1];
+    at->x[AT_DELTA] = atan2(bus[0], bus[1]);
+    u[AT_V_BUS] = hypot(bus[0], bus[1]);
+    u[AT_P_M] = estimator_value[N_ROTOR];
+    u[AT_E_FD] = field_seen + OFFSET;
+    p[AT_X_S] = estimator_value[N_ROTOR + 2];
+    return settle_at(at, u, p) && all_finite(at->x, N_X) && all_finite(at->z, N_Z) && all_finite(u, N_U) && all_finite(p, N_P);
+}
+
+void ${name}_reset(void) {
+    has_plan = prepared = has_origin = 0;
+    field_seen = field_sent = FIELD_0;
+    was_in_charge = 0;
+    ladder_reset();
+    estimator_reset();
+}
+
+void ${name}_step(const ${name}_input *in, ${name}_output *out) {
+    static double measured[N_MEASURED], p[AT_LEAST_1(N_P)], found[N_V];
+    static Point at;
+    double u_last = in->u_last[0] + OFFSET, command;
+    int whole, sound;
+    ladder_look(in->measured, measured);
+    whole = all_finite(measured, N_MEASURED);
+    sound = estimator_observe(whole ? measured : NULL, since_last(whole, measured[N_MEASURED - 1]));
+    was_in_charge = in->active;
+    if (DELAYED) send(in->u_last);
+    has_origin = 0;
+    out->iterations = 0;
+    out->cost = INFINITY;
+    out->status = ${NAME}_STATE_UNKNOWN;
+    if (sound && all_finite(&in->t, 1) && all_finite(&u_last, 1) && locate(&at, p))
+        out->status = plan_from(&at, in->t, p, &u_last, found, &out->cost, &out->iterations);
+    if (out->status <= ${NAME}_ITERATED && ladder_is_stale()) out->status = ${NAME}_STALE;
+    ladder_answer(in->active, &u_last, out->status <= ${NAME}_ITERATED, found, out);
+    command = out->command[0] - OFFSET;
+    out->command[0] = command < PLANT_LOWER ? PLANT_LOWER : command > PLANT_UPPER ? PLANT_UPPER : command;
+    memcpy(out->estimate, estimator_told, sizeof out->estimate);
+}
+
+void ${name}_prepare(const double *command) {
+    if (!DELAYED) send(command);
+}

@@ -1,0 +1,201 @@
+"""The exported controller on an estimated equivalent: Python's commands and estimates, whatever it is told."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import exported
+import numpy as np
+import pytest
+
+from pgexcite.core.config import load
+from pgexcite.core.errors import ConfigError
+from pgexcite.core.export import export_c
+from pgexcite.core.export.recorder import Recorder
+from pgexcite.core.simulate import Simulation
+
+SMIB = Path(__file__).parents[3] / "configs" / "smib"
+FAULT, LINE_TRIP = SMIB / "fault_equivalent.toml", SMIB / "line_trip_equivalent.toml"
+
+LOST = "controller.mpc.measurement.loss=0.3"
+SOFT = 'controller.mpc.soft=[{signal="i_fd", upper=1.8, weight=100.0}]'
+HANDED_OVER = """event=[{type="fault", t=1.0, bus="HV", R=0.02, duration=0.1},
+    {type="hand_over", t=1.5, controller="mpc", to="controller"},
+    {type="hand_over", t=2.5, controller="mpc", to="classical"},
+    {type="hand_over", t=3.0, controller="mpc", to="controller"}]"""
+GENROU = '{model="genrou", H=2.9, X_d=1.24, X_q=1.18, Xp_d=0.35, Xp_q=0.5, Xpp_d=0.24, Tp_d0=6.5}'
+ONE_AXIS = '{model="one_axis", H=2.9, X_d=1.24, X_q=0.70, Xp_d=0.35, Tp_d0=6.5, D=1.0}'
+
+CASES = {
+    "fault": (FAULT, []),
+    "fault, without noise": (FAULT, ["controller.mpc.measurement={}"]),
+    "fault, samples lost": (FAULT, [LOST]),
+    "line trip": (LINE_TRIP, []),
+    "line trip, samples lost": (LINE_TRIP, [LOST]),
+    "soft bound": (FAULT, [SOFT]),
+    "long, rate": (FAULT, ["controller.mpc.N_p=10", "controller.mpc.N_c=5", "controller.mpc.du_max=0.5"]),
+    "many moves": (FAULT, ["controller.mpc.N_p=12", "controller.mpc.N_c=12"]),
+    "standby and take-over": (FAULT, ["controller.mpc.active=false", HANDED_OVER]),
+    "delayed, samples lost": (LINE_TRIP, ["controller.mpc.delayed=true", LOST]),
+    "another belief": (FAULT, ['controller.mpc.options={model={"unit.G2.machine.X_d"=1.36}, estimation={x_s=0.4}}']),
+    "genrou": (FAULT, [f"unit.G2.machine={GENROU}"]),
+    "one_axis": (LINE_TRIP, [f"unit.G2.machine={ONE_AXIS}"]),
+}
+
+pytestmark = pytest.mark.compiler
+
+
+def scenario(config=FAULT, *overrides, t_end=4.0):
+    return load(config, [f"simulation.t_end={t_end}", *overrides])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_its_commands_and_estimates_are_those_of_python(case, tmp_path):
+    config, overrides = CASES[case]
+    found = export_c(scenario(config, *overrides), tmp_path / "out")
+    code, figures = exported.replay(found.directory)
+    assert code == 0
+    assert figures["samples"] == found.samples == 80
+    assert figures["largest difference of a command"] < 1e-6  # measured 2e-11; with rows, ProxQP's tolerance: 7e-8
+    assert figures["largest difference of an estimate"] < 1e-9  # measured 6e-12 to 2e-11
+    assert figures["samples on another level"] == 0
+    assert figures["samples with another number of iterations"] == 0
+
+
+def session_of(case):
+    return Simulation(case.system, case.settings, case.changes, case.controllers).sessions["mpc"]
+
+
+def samples_of(case):
+    """What the controller is handed in a run."""
+    simulation = Simulation(case.system, case.settings, case.changes, case.controllers)
+    session, samples = simulation.sessions["mpc"], []
+    act = session.act
+
+    def recorded(sample):
+        samples.append(sample)
+        return act(sample)
+
+    session.act = recorded
+    simulation.run()
+    return samples
+
+
+def troubled(samples, rng, n):
+    """The samples over and over: lost, hanging or absurd for a while, in charge or not."""
+    before, left, trouble, active = samples[0].measured, 0, "", True
+    for k in range(n):
+        sample = samples[k % len(samples)]
+        measured = dict(sample.measured)
+        if left == 0:
+            trouble = str(rng.choice(["", "", "lost", "hangs", "wild", "absurd"]))
+            left = int(rng.integers(1, 12))
+        left -= 1
+        if rng.random() < 0.03:
+            active = not active
+        if trouble == "hangs":
+            measured = before
+        elif trouble == "lost":
+            measured = dict.fromkeys(measured, np.nan)
+        elif trouble:
+            scale = 1.0 if trouble == "wild" else 1e3
+            measured["unit.G2.v_t"] += scale * rng.normal()
+            measured["unit.G2.p_e"] += scale * rng.normal()
+        before = measured
+        yield replace(sample, t=0.05 * k, measured=measured, active=active)
+
+
+@pytest.mark.parametrize("delayed", [False, True])
+def test_in_whatever_trouble_it_does_what_python_does(delayed, tmp_path):
+    """Through losses, hanging transmitters, wild samples, restarts and changes of who is in charge."""
+    case = scenario(FAULT, f"controller.mpc.delayed={str(delayed).lower()}")
+    export_c(case, tmp_path)
+    session = session_of(case)
+    recorder, levels = Recorder(session, session.solver.parts("", ())), []
+    for sample in troubled(samples_of(case), np.random.default_rng(4), 600):
+        session.act(sample)
+        session.prepare()
+        levels.append(session.level)
+    assert min(levels.count(level) for level in (0, 1, 2)) > 20
+    (tmp_path / "replay.txt").write_text("".join(f"{line}\n" for line in recorder.lines))
+    code, figures = exported.replay(tmp_path)
+    assert code == 0
+    assert figures["samples"] == 600
+    assert figures["largest difference of a command"] < 1e-6  # measured 3e-11 and 5e-11
+    assert figures["largest difference of an estimate"] < 1e-9  # measured 1e-11
+    assert figures["samples on another level"] == 0
+
+
+def test_it_stands_alone_and_allocates_nothing(tmp_path):
+    export_c(scenario(t_end=1.0), tmp_path)
+    exported.build(tmp_path)
+    offered, wanted = exported.symbols(tmp_path)
+    assert offered == {"mpc_reset", "mpc_step", "mpc_prepare"}
+    assert wanted == set()
+
+
+GARBAGE = [np.nan, np.inf, -np.inf, 1e300, -1e300, 1e12, 999.0, -999.0, 0.0, 1e-300]
+
+
+def test_whatever_it_is_told_its_command_is_finite_and_within_its_bounds(tmp_path):
+    export_c(scenario(), tmp_path)
+    controller, rng = exported.Library(tmp_path), np.random.default_rng(3)
+    levels = []
+    for k in range(3000):
+        controller.load(k % len(controller.lines))
+        for _ in range(int(rng.integers(4)) if k % 100 > 50 else 0):
+            if rng.random() < 0.8:
+                controller.input.measured[int(rng.integers(5))] = float(rng.choice(GARBAGE))
+            else:
+                controller.input.u_last[0], controller.input.t = rng.choice(GARBAGE, 2)
+        out = controller.step()
+        assert -3.2 <= out.command[0] <= 3.2
+        # The estimate stays one: x_s and v_bus within their bounds, with deviations.
+        assert 0.02 <= out.estimate[0] <= 2.0
+        assert 0.05 - 1e-12 <= out.estimate[2] <= 1.5 + 1e-12
+        assert np.isfinite(list(out.estimate)[:6]).all()
+        levels.append(out.level)
+    assert set(levels) == {0, 1, 2}
+
+
+def test_garbage_breaks_no_rule_of_the_language(tmp_path):
+    """The same under the sanitizers of addresses and of undefined behaviour."""
+    export_c(scenario(), tmp_path)
+    sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
+    command = [
+        exported.compiler(),
+        "-std=c99",
+        "-O1",
+        "-g",
+        *sanitizers,
+        "mpc.c",
+        "mpc_replay.c",
+        "-o",
+        "checked",
+        "-lm",
+    ]
+    if subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode:
+        pytest.skip("the compiler has no sanitizers")
+    rng, lines = np.random.default_rng(5), []
+    for line in (tmp_path / "replay.txt").read_text().splitlines() * 10:
+        words = line.split()
+        for k in range(8):
+            if k != 1 and rng.random() < 0.1:
+                words[k] = str(rng.choice(GARBAGE))
+        lines.append(" ".join(words))
+    (tmp_path / "garbage.txt").write_text("\n".join(lines) + "\n")
+    done = subprocess.run(["./checked", "garbage.txt"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    assert "samples 800" in done.stdout
+
+
+def test_what_cannot_be_exported_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="must be positive"):
+        export_c(scenario(FAULT, "controller.mpc.R=0.0"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    solver = session_of(scenario()).solver
+    solver._observer = object()
+    with pytest.raises(ConfigError, match="this estimator offers no C"):
+        solver.parts("controller.mpc", ())
