@@ -198,6 +198,11 @@ WRONG = [
     (lambda d: d.update(event=[{"t": 1, "type": "line_trip", "name": "L2"}]), "event.0.name", "did you mean 'L1'?"),
     (lambda d: d.update(event=[{"t": 1, "type": "load_step", "load": "x"}]), "event.0.load", "there is no such load"),
     (
+        lambda d: d.update(event=[{"t": 1, "type": "hand_over", "controller": "x", "to": "classical"}]),
+        "event.0.controller",
+        "there is no such controller",
+    ),
+    (
         lambda d: d.update(event=[{"t": 1, "type": "set", "path": "unit.G1.machine.h", "value": 1}]),
         "event.0.path",
         "there is no such parameter or set-point (got 'unit.G1.machine.h'); did you mean 'unit.G1.machine.H'?",

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from pgexcite.core import registry
 from pgexcite.core.config.validate import Collector
 from pgexcite.core.declare import Kind
-from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, LoadStep, ParameterStep, boundary
+from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, HandOver, LoadStep, ParameterStep, boundary
 from pgexcite.core.network import Branch
 from pgexcite.core.system import Device, System
 
@@ -89,6 +89,8 @@ def check_event(event: BaseModel, where: str, grid: Grid, collect: Collector) ->
         collect.known(kind, event.name, grid.names[kind], f"{where}.name")
     elif isinstance(event, LoadStep):
         collect.known("load", event.load, grid.names["load"], f"{where}.load")
+    elif isinstance(event, HandOver):
+        collect.known("controller", event.controller, grid.names["controller"], f"{where}.controller")
     elif isinstance(event, ParameterStep) and not any(event.path.startswith(f"{path}.") for path in grid.broken):
         _check_parameter_step(event, where, grid.system, collect)
 
