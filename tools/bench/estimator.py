@@ -1,8 +1,9 @@
 """The estimator of the equivalent and the NMPC on it: what a sample of a closed loop costs, and what filterpy alone would.
 
-The loop is configs/smib/fault_equivalent.toml (50 ms, N_p = 5, N_c = 1, 1 % of noise, a fault of 0.1 s); times are thread CPU. An
-estimator's sample is one prediction, one update and what it tells of itself; where the network has changed it tries up to three
-updates, and those samples are counted apart. filterpy's own filter gets the same functions, a Python call for each sigma point.
+The loop is configs/smib/fault_equivalent.toml (50 ms, N_p = 5, N_c = 1, 1 % of noise, a fault of 0.1 s); times are thread CPU.
+An estimator's sample is one prediction, one update and what it tells of itself; where the network has changed it tries up to
+three updates, and those samples are counted apart. filterpy's own filter gets the same functions, a Python call for each sigma
+point. The exported C replays the same loop.
 
 Run: python tools/bench/estimator.py [--passes 30]
 """
@@ -14,9 +15,12 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
+import ctypes
 import gc
 import json
 import platform
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +30,9 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import UnscentedKalmanFilter
 
-from pgexcite.core.config import load
+from pgexcite.core import codegen
+from pgexcite.core.config import Scenario, load
+from pgexcite.core.export import export_c
 from pgexcite.core.simulate import Simulation
 from pgexcite.plugins.estimators.mapped_filter import SigmaPoints
 
@@ -66,6 +72,43 @@ def loop(simulation: Simulation) -> dict[str, list[float]]:
     }
 
 
+class Controller:
+    """The exported controller as a library, and what it was told in the closed loop."""
+
+    def __init__(self, scenario: Scenario, folder: Path) -> None:
+        export_c(scenario, folder)
+        compiler = codegen.compiler()
+        assert compiler is not None
+        command = [compiler, "-std=c99", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "mpc.c", "-o", "mpc.so", "-lm"]
+        subprocess.run(command, cwd=folder, check=True)
+        self._library = ctypes.CDLL(str(folder / "mpc.so"))
+        lines = (folder / "replay.txt").read_text().splitlines()
+        self._inputs = [_input([float(word) for word in line.split()]) for line in lines]
+
+    def loop(self) -> dict[str, list[float]]:
+        """Times of one pass."""
+        output = (ctypes.c_double * 32)()
+        step = Timed(self._library.mpc_step)
+        self._library.mpc_reset()
+        for item in self._inputs:
+            step(ctypes.byref(item), output)
+            self._library.mpc_prepare(output)
+        return {"estimator + NMPC (exported C)": step.times}
+
+
+class _Input(ctypes.Structure):
+    _fields_ = (
+        ("t", ctypes.c_double),
+        ("active", ctypes.c_int),
+        ("measured", ctypes.c_double * 5),
+        ("u_last", ctypes.c_double),
+    )
+
+
+def _input(numbers: list[float]) -> _Input:
+    return _Input(numbers[0], int(numbers[1]), (ctypes.c_double * 5)(*numbers[2:7]), numbers[7])
+
+
 def stock(simulation: Simulation, samples: int) -> dict[str, list[float]]:
     """Predict and update of filterpy's own filter on the same functions, us."""
     simulation.restart()
@@ -103,11 +146,15 @@ def main() -> None:
         for name, how in (("C", "always"), ("virtual machine", "never"))
     }
     times: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        controller = Controller(scenario, Path(folder))
     gc.freeze()
     for _ in range(passes):
         for name, simulation in simulations.items():
             for what, found in loop(simulation).items():
                 times.setdefault(f"{what} ({name})", []).extend(found)
+        for what, found in controller.loop().items():
+            times.setdefault(what, []).extend(found)
     times |= stock(simulations["virtual machine"], 60)
     rows = {
         name: {

@@ -159,7 +159,7 @@ class _Equivalent(Shooting):
             raise ConfigError([Problem(f"{where}.options.estimator", "this estimator offers no C")])
         estimator, (functions, constants, arrays) = self._observer.written(), planning(self)
         seen = [*self._paths, self._field]
-        told = "measured at this instant, pu; NaN where lost"
+        told = "measured at this instant, pu of the unit's base; NaN where lost"
         return Parts(
             about=_ABOUT + DELAYED * self.problem.delayed,
             inputs=(
