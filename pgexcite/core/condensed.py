@@ -32,6 +32,19 @@ class QPSolver(Protocol):
 
 
 @dataclass(frozen=True)
+class Curvature:
+    """What a program owes to the derivatives alone.
+
+    Attributes:
+        weighted: twice the weights times the derivatives of the tracked outputs, shape ``(n, N_p * n_tracked)``.
+        H: Gauss-Newton Hessian of the tracked cost, shape ``(n, n)``.
+    """
+
+    weighted: Array
+    H: Array
+
+
+@dataclass(frozen=True)
 class Linearised:
     """A prediction around a plan.
 
@@ -39,11 +52,18 @@ class Linearised:
         y: predicted outputs ``(voltages, speeds, soft-bounded)`` at the end of each sample, shape ``(N_p, n_y)``.
         G: derivatives to the moves, shape ``(N_p, n_y, N_c * n_u)``.
         references: of the voltages, shape ``(N_p, n_voltages)``.
+        curvature: by ``Condensed.curvature``, where it is known already.
     """
 
     y: Array
     G: Array
     references: Array
+    curvature: Curvature | None = None
+
+    def after(self, step: Array) -> Array:
+        """Outputs after a step of the plan, to first order, shape ``(N_p, n_y)``."""
+        flat: Array = self.G.reshape(-1, self.G.shape[2]) @ step.ravel()
+        return self.y + flat.reshape(self.y.shape)
 
 
 class Condensed:
@@ -70,6 +90,7 @@ class Condensed:
         weights = np.concatenate((problem.Q, problem.P))
         self._weights = np.tile(weights, (problem.N_p, 1))
         self._weights[-1] *= problem.terminal
+        self._twice = 2 * self._weights.ravel()
         self._n_tracked = weights.size
         self._R = np.tile(problem.R, problem.N_c)
         self._move_hessian = 2 * (self._difference.T * self._R) @ self._difference
@@ -78,23 +99,30 @@ class Condensed:
         self._soft_lower = np.array([bound.lower for bound in problem.soft])
         self._soft_upper = np.array([bound.upper for bound in problem.soft])
         self._soft_weight = np.array([bound.weight for bound in problem.soft])
+        self._slack_hessian = np.zeros((self.variables, self.variables))
+        slacks = np.arange(self.n, self.variables)
+        self._slack_hessian[slacks, slacks] = np.tile(2 * self._soft_weight, problem.N_p)
 
     def outputs(self) -> tuple[str, ...]:
         """Paths of the outputs a prediction must give."""
         return (*self.problem.voltages, *self.problem.speeds, *(bound.path for bound in self.problem.soft))
 
     def _moves(self, plan: Array, u_last: Array) -> Array:
-        return np.diff(plan, axis=0, prepend=u_last[None]).ravel()
+        moves = plan.flatten()
+        moves[u_last.size :] -= plan.ravel()[: -u_last.size]
+        moves[: u_last.size] -= u_last
+        return moves
 
     def _errors(self, y: Array, references: Array) -> Array:
-        target = np.ones((y.shape[0], self._n_tracked))
-        target[:, : references.shape[1]] = references
-        return y[:, : self._n_tracked] - target
+        errors = y[:, : self._n_tracked].copy()
+        errors[:, : references.shape[1]] -= references
+        errors[:, references.shape[1] :] -= 1.0
+        return errors
 
     def cost(self, y: Array, references: Array, plan: Array, u_last: Array) -> float:
         """Cost of a plan, soft bounds included."""
         errors, moves = self._errors(y, references), self._moves(plan, u_last)
-        total = np.sum(errors * errors * self._weights) + np.sum(self._R * moves * moves)
+        total = np.vdot(errors * errors, self._weights) + (self._R * moves) @ moves
         if self._n_soft:
             total += np.sum(self._soft_weight * self._excess(y) ** 2)
         return float(total)
@@ -103,14 +131,20 @@ class Condensed:
         soft = y[:, self._n_tracked :]
         return np.maximum(soft - self._soft_upper, 0.0) + np.maximum(self._soft_lower - soft, 0.0)
 
+    def curvature(self, G: Array) -> Curvature:
+        """What programs around a prediction with these derivatives share."""
+        J = G[:, : self._n_tracked].reshape(-1, self.n)
+        weighted = J.T * self._twice
+        return Curvature(weighted, weighted @ J + self._move_hessian)
+
     def quadratic(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, Array]:
         """Gauss-Newton Hessian and gradient of the tracked cost in the plan, shapes ``(n, n)`` and ``(n,)``; no soft bounds."""
-        J = at.G[:, : self._n_tracked].reshape(-1, self.n)
-        weighted = J.T * self._weights.ravel()
-        H = 2 * (weighted @ J) + self._move_hessian
-        moves = self._R * self._moves(plan, u_last)
-        g = 2 * (weighted @ self._errors(at.y, at.references).ravel() + self._difference.T @ moves)
-        return H, g
+        shared = at.curvature or self.curvature(at.G)
+        g = shared.weighted @ self._errors(at.y, at.references).ravel()
+        moved = 2 * self._R * self._moves(plan, u_last)
+        g += moved
+        g[: -u_last.size] -= moved[u_last.size :]
+        return shared.H, g
 
     def direction(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, float] | None:
         """The program's step from a plan, shape ``(N_c, n_u)``, and its slope of the cost; ``None`` where it was not solved."""
@@ -121,10 +155,8 @@ class Condensed:
         if self.rows:
             rows, rows_lower, rows_upper = self._constraints(at, plan, u_last)
         if self._n_slack:
-            weights = np.tile(self._soft_weight, self.problem.N_p)
-            H = np.block(
-                [[H, np.zeros((self.n, self._n_slack))], [np.zeros((self._n_slack, self.n)), np.diag(2 * weights)]]
-            )
+            H, tracked = self._slack_hessian.copy(), H
+            H[: self.n, : self.n] = tracked
             g = np.concatenate((g, np.zeros(self._n_slack)))
             lower = np.concatenate((lower, np.zeros(self._n_slack)))
             upper = np.concatenate((upper, np.full(self._n_slack, np.inf)))
@@ -161,10 +193,12 @@ class Condensed:
 
     def clipped(self, plan: Array) -> Array:
         """A plan within the bounds on commands."""
-        return np.clip(plan, self.problem.u_min, self.problem.u_max)
+        return np.minimum(np.maximum(plan, self.problem.u_min), self.problem.u_max)
 
     def reachable(self, plan: Array, u_last: Array) -> Array:
         """The nearest plan that keeps the bounds on moves from ``u_last`` on, and those on commands."""
+        if not self._rate:
+            return self.clipped(plan)
         kept = np.empty_like(plan)
         before = u_last
         for k, move in enumerate(plan):

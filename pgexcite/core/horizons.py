@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,26 @@ _SAME_INSTANT = 1e-9
 
 
 @dataclass(frozen=True)
+class _Plain:
+    """A horizon on which nothing is known to happen.
+
+    Attributes:
+        pieces: counts, lengths, moves, rows and ends, as ``Horizon`` has them.
+        ends: of the intervals, s from the start, shape ``(N,)``.
+    """
+
+    pieces: tuple[NDArray[np.int32], Array, NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]
+    ends: Array
+
+    @staticmethod
+    def of(intervals: Array, count: int, moves: NDArray[np.int32]) -> _Plain:
+        """Intervals (s) of ``count`` steps each."""
+        n = intervals.size
+        counts, rows, ends = np.full(n, count, np.int32), np.zeros(n, np.int32), np.ones(n, np.int32)
+        return _Plain((counts, intervals / count, moves, rows, ends), np.cumsum(intervals))
+
+
+@dataclass(frozen=True)
 class Horizons:
     """Makes the horizon of each sample.
 
@@ -26,7 +47,7 @@ class Horizons:
         model: the model that predicts.
         problem: the control problem.
         h: prediction step in the first interval, s; it grows with the intervals.
-        grid: the plant's step, s: a known event takes place at the first step boundary not before it.
+        grid: the plant's step, s: a known event takes place at the first of its ends not before it. It divides the sample time.
     """
 
     model: Model
@@ -36,17 +57,35 @@ class Horizons:
 
     def at(self, t: float, u: Array, p: Array) -> Horizon:
         """The horizon that begins at ``t`` with commands ``u`` and parameters ``p`` in force."""
+        return self._cut(self._whole, t, u, p)
+
+    def first(self, t: float, u: Array, p: Array) -> Horizon:
+        """Its first interval alone, in the plant's own steps."""
+        return self._cut(self._sample, t, u, p)
+
+    @cached_property
+    def _whole(self) -> _Plain:
         problem = self.problem
         count = max(1, round(problem.dt / self.h))
-        ends = t + np.cumsum(problem.intervals())
-        pending = [(self.instant(change), change) for change in problem.known]
-        pending = [item for item in pending if t + _SAME_INSTANT < item[0] < ends[-1] - _SAME_INSTANT]
+        return _Plain.of(problem.intervals(), count, problem.moves_per_sample())
+
+    @cached_property
+    def _sample(self) -> _Plain:
+        dt = self.problem.dt
+        return _Plain.of(np.array([dt]), max(1, round(dt / self.grid)), np.zeros(1, dtype=np.int32))
+
+    def _cut(self, plain: _Plain, t: float, u: Array, p: Array) -> Horizon:
         row_u, row_p = self._fixed(u), np.array(p, dtype=float)
+        ends = t + plain.ends
+        pending = [(self.instant(change), change) for change in self.problem.known]
+        pending = [item for item in pending if t + _SAME_INSTANT < item[0] < ends[-1] - _SAME_INSTANT]
+        if not pending:
+            return Horizon(*plain.pieces, row_p[None], row_u[None])
         us, ps = [row_u], [row_p]
         pieces: list[tuple[int, float, int, int, int]] = []
         here = t
-        for end, interval, move in zip(ends, problem.intervals(), problem.moves_per_sample(), strict=True):
-            h = interval / count
+        for end, h, count, move in zip(ends, *(plain.pieces[k] for k in (1, 0, 2)), strict=True):
+            begun = len(ps)
             while pending and pending[0][0] < end - _SAME_INSTANT:
                 instant, change = pending.pop(0)
                 pieces += _piece(instant - here, h, int(move), len(ps) - 1, ends=False)
@@ -54,7 +93,10 @@ class Horizons:
                 us.append(row_u)
                 ps.append(row_p)
                 here = max(here, instant)
-            pieces += _piece(end - here, h, int(move), len(ps) - 1, ends=True)
+            if len(ps) == begun:
+                pieces.append((int(count), float(h), int(move), len(ps) - 1, 1))
+            else:
+                pieces += _piece(end - here, h, int(move), len(ps) - 1, ends=True)
             here = end
             while pending and pending[0][0] <= end + _SAME_INSTANT:
                 _, change = pending.pop(0)
@@ -63,13 +105,13 @@ class Horizons:
                 ps.append(row_p)
         counts, lengths, moves, rows, closing = zip(*pieces, strict=True)
         return Horizon(
-            counts=np.array(counts, dtype=np.int32),
-            lengths=np.array(lengths),
-            moves=np.array(moves, dtype=np.int32),
-            rows=np.array(rows, dtype=np.int32),
-            ends=np.array(closing, dtype=np.int32),
-            p=np.array(ps),
-            u=np.array(us),
+            np.array(counts, dtype=np.int32),
+            np.array(lengths),
+            np.array(moves, dtype=np.int32),
+            np.array(rows, dtype=np.int32),
+            np.array(closing, dtype=np.int32),
+            np.array(ps),
+            np.array(us),
         )
 
     def until(self, t: float, u: Array, p: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
@@ -116,14 +117,27 @@ class Problem:
 
     def shifted(self, plan: Array) -> Array:
         """A plan one sample later: each move is what was in force one sample after its own beginning, shape ``(N_c, n_u)``."""
+        return plan[self._following]
+
+    @cached_property
+    def _following(self) -> NDArray[np.int32]:
+        """The move in force one sample after the beginning of each, shape ``(N_c,)``."""
         starts = np.concatenate(([0], np.cumsum(self.blocks)[:-1]))
-        return plan[self.moves_per_sample()[np.minimum(starts + 1, self.N_p - 1)]]
+        return self.moves_per_sample()[np.minimum(starts + 1, self.N_p - 1)]
 
     def references(self, t: float) -> Array:
         """``V_ref`` at the end of each interval of a horizon that begins at ``t``, shape ``(N_p, len(voltages))``."""
+        if not (self.previews or self.steps):
+            return self._constant_references
         now = t - self.dt if self.delayed else t
         ends = t + np.cumsum(self.intervals())
         return np.array([self._reference(end, now) for end in ends]).reshape(self.N_p, -1)
+
+    @cached_property
+    def _constant_references(self) -> Array:
+        constant = np.tile(self.V_ref, (self.N_p, 1))
+        constant.setflags(write=False)
+        return constant
 
     def reference_at(self, t: float) -> Array:
         """``V_ref`` in force at ``t``."""

@@ -134,6 +134,7 @@ class Predictor:
         columns = n_x + n_u if self.transitions else n_moves * n_u
         self._functions = write_sensitivities(kernel, self._commands, self._outputs, columns)
         self._library = self._compile(columns)
+        self._commands_at = _address(self._commands)
         stage, history, output = self._functions
         k, rows = kernel, (kernel.w.size, n_x, n_u, self._outputs.size)
         # CasADi keeps matrices column by column, so a row of these arrays is a column of the sensitivity.
@@ -146,6 +147,7 @@ class Predictor:
         self._stage_middle = bind(stage, [k.middle, k.b_middle, k.c, *given, S_b, S_c], [S_new])
         self._history = bind(history, [self._x, self._z, *given, k.c, S, S_c], [S_b])
         self._y = np.zeros(self._outputs.size)
+        self._call = _Call([np.zeros(n) for n in (n_x, k.z.size, k.d.size)], n_moves * n_u)
         self._output = bind(output, [k.x, k.z, *given, S, S_c], [self._y, S_y])
 
     def _compile(self, columns: int) -> ctypes.CDLL | None:
@@ -218,14 +220,17 @@ class Predictor:
 
     def _roll_compiled(self, state: State, moves: Array, horizon: Horizon, y: Array, dy: Array, dx: Array) -> bool:
         assert self._library is not None
-        point = [np.array(a) for a in (state.x, state.z, state.d)]
-        pieces = (horizon.counts, horizon.lengths, horizon.moves, horizon.rows, horizon.ends)
+        call = self._call
+        call.load(state, moves, horizon)
         done = self._library.pgexcite_rollout(
             RULES.index(self._rule),
             len(horizon.counts),
-            *(_address(a) for a in (*pieces, self._commands)),
+            *call.pieces,
+            self._commands_at,
             state.startup,
-            *(_address(a) for a in (*point, horizon.p, horizon.u, moves)),
+            *call.point,
+            *(_address(a) for a in (horizon.p, horizon.u)),
+            call.moves,
             int(dy.size > 0),
             *(_address(a) for a in (y, dy, dx)),
         )
@@ -340,6 +345,31 @@ class Predictor:
                 self._S_b[:] = kernel.mass * (ALPHA * self._S_new[:, :n_x] - BETA * self._S[:, :n_x])
         self._stage.trigger()
         self._S[:] = self._S_new
+
+
+class _Call:
+    """Arguments of the compiled loop that stay where they are: an address costs more than copying a few numbers.
+
+    Attributes:
+        point: addresses of ``x``, ``z`` and ``d``, which the loop moves on.
+        moves: address of the moves.
+        pieces: addresses of the horizon's counts, lengths, moves, rows and ends.
+    """
+
+    def __init__(self, point: list[Array], n_moves: int) -> None:
+        self._point, self._moves = point, np.zeros(n_moves)
+        self.point, self.moves = [_address(a) for a in point], _address(self._moves)
+        self._kept: tuple[NDArray[Any], ...] = ()
+        self.pieces: list[ctypes.c_void_p] = []
+
+    def load(self, state: State, moves: Array, horizon: Horizon) -> None:
+        """Put a prediction's arguments in place."""
+        for array, values in zip(self._point, (state.x, state.z, state.d), strict=True):
+            array[:] = values
+        self._moves[:] = moves.ravel()
+        pieces = (horizon.counts, horizon.lengths, horizon.moves, horizon.rows, horizon.ends)
+        if len(self._kept) != len(pieces) or any(a is not b for a, b in zip(self._kept, pieces, strict=True)):
+            self._kept, self.pieces = pieces, [_address(a) for a in pieces]
 
 
 def _address(array: NDArray[Any]) -> ctypes.c_void_p:

@@ -2,15 +2,20 @@
 
 ProxQP's default limits let a contradictory problem of ten variables run for half a minute. Inputs are therefore checked first and
 the caps are the deadline.
+
+A program with nothing but a box is first tried with the bounds that were active last. Where that set, or one a few exchanges away,
+satisfies the optimality conditions, the program is solved, exactly and in a tenth of the time; else ProxQP solves it.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import proxsuite
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 Array = NDArray[np.float64]
 
@@ -20,6 +25,11 @@ _EPS_INFEASIBLE = 1e-12
 WIDE = 1e20
 _MAX_ITERATIONS = 60
 _MAX_INNER_ITERATIONS = 60
+_MAX_EXCHANGES = 20
+_PATIENCE = 3
+_CROSSED = 1e-12
+_STATIONARY = 1e-9
+"""Largest slope, against the largest one of the program, that is left where a variable is free of its bounds."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +99,11 @@ class QuadraticProgram:
         n, m = self._n, self._m
         if not usable(H, g, lower, upper, rows, rows_lower, rows_upper):
             return QPSolution(np.zeros(n), np.zeros(m + n), False, 0)
+        if not m:
+            found = exchange(H, g, lower, upper, self._multipliers)
+            if found is not None:
+                self._multipliers = found.multipliers
+                return found
         if m:
             self._rows[:m], self._low[:m], self._high[:m] = rows, rows_lower, rows_upper
         self._low[m:], self._high[m:] = lower, upper
@@ -104,6 +119,56 @@ class QuadraticProgram:
         return QPSolution(np.clip(x, lower, upper), z, solved, int(results.info.iter))
 
 
+def exchange(H: Array, g: Array, lower: Array, upper: Array, multipliers: Array) -> QPSolution | None:
+    """Block principal pivoting for a program with bounds only, started from the bounds these multipliers are of.
+
+    J. J. Judice, F. M. Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity
+    problems", Computers and Operations Research 21 (1994) 587-596: all variables on a wrong side change it at once, while that
+    makes them fewer; else the last of them alone, by which no set can come back.
+
+    Returns:
+        The minimiser; ``None`` where ``H`` is not positive definite, or the active set is not found in ``_MAX_EXCHANGES``.
+    """
+    stationary = _STATIONARY * max(1.0, float(np.abs(g).max(initial=0.0)))
+    if not multipliers.any():
+        _, x, failed = dposv(H, -g)
+        if not failed and (x <= upper).all() and (x >= lower).all() and np.abs(H @ x + g).max() <= stationary:
+            return QPSolution(x, np.zeros_like(x), True, 1)
+    at_upper, at_lower = multipliers > 0, multipliers < 0
+    fewest, patience = g.size + 1, _PATIENCE
+    for iteration in range(1, _MAX_EXCHANGES + 1):
+        active = at_upper | at_lower
+        free = ~active
+        if active.any():
+            bound = np.where(at_upper, upper, np.where(at_lower, lower, 0.0))
+            # The rows and columns of what is at a bound become those of the unit matrix.
+            reduced, right = H * free * free[:, None], bound - free * (g + H @ bound)
+            reduced.flat[:: g.size + 1] += active
+        else:
+            reduced, right = H, -g
+        _, x, failed = dposv(reduced, right)
+        if failed:
+            return None
+        slope = -(H @ x + g)
+        if not np.abs(slope * free).max() <= stationary:
+            return None
+        slope *= active
+        over, under = x > upper + _CROSSED, x < lower - _CROSSED
+        wrong = over | under | (at_upper & (slope < 0)) | (at_lower & (slope > 0))
+        count = int(np.count_nonzero(wrong))
+        if count == 0:
+            return QPSolution(np.minimum(np.maximum(x, lower), upper), slope, True, iteration)
+        if count < fewest:
+            fewest, patience = count, _PATIENCE
+        elif patience:
+            patience -= 1
+        else:
+            wrong[: np.flatnonzero(wrong)[-1]] = False
+        # What is at a bound is freed; what is free goes to the bound it has crossed.
+        at_upper, at_lower = (at_upper & ~wrong) | (over & wrong), (at_lower & ~wrong) | (under & wrong)
+    return None
+
+
 def usable(
     H: Array,
     g: Array,
@@ -115,8 +180,8 @@ def usable(
 ) -> bool:
     """Whether a solver may be handed this: finite, and no bound above its opposite (a NaN compares false)."""
     # A sum is finite only if every term is: cheaper than a look at each.
-    if not np.isfinite(H.sum() + g.sum()) or not (lower <= upper).all():
+    if not math.isfinite(H.sum() + g.sum()) or not (lower <= upper).all():
         return False
     if rows is None or rows_lower is None or rows_upper is None:
         return True
-    return bool(np.isfinite(rows.sum()) and (rows_lower <= rows_upper).all())
+    return bool(math.isfinite(rows.sum()) and (rows_lower <= rows_upper).all())

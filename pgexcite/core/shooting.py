@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.condensed import Condensed, Linearised, QPSolver
+from pgexcite.core.condensed import Condensed, Curvature, Linearised, QPSolver
 from pgexcite.core.controller import Sample
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.model import State
@@ -40,6 +41,7 @@ class ShootingOptions:
         max_iterations: QPs for one plan at the most, when converging.
         jump_iterations: QPs for one plan where the state is not what was expected.
         jump: difference of a state from what was expected that counts as a jump.
+        jump_tolerance: change of a command at which a plan made after a jump is near enough: the next sample goes on from it.
         tolerance: largest change of a command at which a plan has converged.
         exact: whether the state comes out exactly as expected unless something happened (perfect information). A prepared plan
             then needs no derivatives to the state, which many states make dear.
@@ -49,8 +51,9 @@ class ShootingOptions:
 
     mode: Literal["rti", "converged"] = "rti"
     max_iterations: int = 20
-    jump_iterations: int = 4
+    jump_iterations: int = 2
     jump: float = 1e-3
+    jump_tolerance: float = 1e-3
     tolerance: float = 1e-6
     exact: bool = False
     candidates: int = 0
@@ -68,6 +71,10 @@ class _Prepared:
     y: Array
     G: Array
     G_x: Array
+
+    def arrays(self) -> dict[str, Array]:
+        """All of it, by name."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
 class Shooting(ABC):
@@ -107,6 +114,7 @@ class Shooting(ABC):
         self.horizons = Horizons(model, problem, h, grid)
         self._plan: Array | None = None
         self._prepared: _Prepared | None = None
+        self._curvature: Curvature | None = None
         self._from: tuple[State, float, Array] | None = None
         owned = {*problem.commands, *problem.fixed}
         self._others = np.array([path not in owned for path in model.u_names], dtype=bool)
@@ -129,7 +137,7 @@ class Shooting(ABC):
 
     def prepare(self, u: Array) -> None:
         """Linearise around the plan the next sample will start from, at the state expected then."""
-        self._prepared = None
+        self._ready(None)
         if self.options.mode != "rti" or self._from is None or self._plan is None:
             return
         state, t, p = self._from
@@ -142,7 +150,11 @@ class Shooting(ABC):
         rollout = self.predictor.roll(expected, plan, horizon, derivatives=True)
         if rollout is not None and rollout.dy is not None:
             G_x = np.zeros((*rollout.y.shape, 0)) if rollout.dx is None else rollout.dx
-            self._prepared = _Prepared(plan, expected.x, expected.d, expected.u, p, rollout.y, rollout.dy, G_x)
+            self._ready(_Prepared(plan, expected.x, expected.d, expected.u, p, rollout.y, rollout.dy, G_x))
+
+    def _ready(self, prepared: _Prepared | None) -> None:
+        self._prepared = prepared
+        self._curvature = self.condensed.curvature(prepared.G) if prepared else None
 
     def memory(self) -> Mapping[str, Array]:
         """Plan, linearisation and the QP's warm start."""
@@ -150,7 +162,7 @@ class Shooting(ABC):
         if self._plan is not None:
             kept["plan"] = self._plan
         if self._prepared is not None:
-            kept |= {f"prepared:{name}": value for name, value in vars(self._prepared).items()}
+            kept |= {f"prepared:{name}": value for name, value in self._prepared.arrays().items()}
         if isinstance(solver := self.condensed.solver, QuadraticProgram):
             kept["multipliers"] = solver.memory()
         return kept
@@ -160,42 +172,39 @@ class Shooting(ABC):
         self._plan = memory.get("plan")
         start = "prepared:"
         prepared = {key.removeprefix(start): value for key, value in memory.items() if key.startswith(start)}
-        self._prepared = _Prepared(**prepared) if prepared else None
+        self._ready(_Prepared(**prepared) if prepared else None)
         if isinstance(solver := self.condensed.solver, QuadraticProgram):
             solver.recall(memory["multipliers"])
 
     # Planning.
 
     def _from_state(self, state: State | None, t: float, u_last: Array) -> Solution:
-        hold = self.condensed.clipped(np.tile(u_last, (self.problem.N_c, 1)))
         if state is None or not _finite(state, self.p):
             self._from = None
-            return Solution(Status.STATE_UNKNOWN, hold, np.inf, 0, np.inf)
+            return self._failed(Status.STATE_UNKNOWN, u_last)
         p = self.p
         if self.problem.delayed:
             later = self._advance(state, t, u_last, p)
             if later is None:
-                return Solution(Status.PREDICTION_FAILED, hold, np.inf, 0, np.inf)
+                return self._failed(Status.PREDICTION_FAILED, u_last)
             state, p = later
             t += self.problem.dt
         self._from = (state, t, p)
-        expected = self._expected(state, p)
-        if expected is not None:
-            solution = self._feedback(expected, state, t, u_last)
-        else:
-            converge = self.options.mode == "converged" or self._plan is None
-            count = self.options.max_iterations if converge else self.options.jump_iterations
-            solution = self._iterate(state, t, p, u_last, count)
+        ready = self._expected(state, p)
+        solution = self._feedback(ready, state, t, u_last) if ready else self._iterate(state, t, p, u_last)
         if solution.status.usable:
             self._plan = solution.u
         return solution
 
+    def _failed(self, status: Status, u_last: Array) -> Solution:
+        hold = self.condensed.clipped(np.tile(u_last, (self.problem.N_c, 1)))
+        return Solution(status, hold, np.inf, 0, np.inf)
+
     def _advance(self, state: State, t: float, u: Array, p: Array) -> tuple[State, Array] | None:
         """State and parameters one sample later under these commands, with all that is known to happen by then."""
-        horizon = self.horizons.at(t, state.u, p)
-        last = int(np.flatnonzero(horizon.ends)[0]) + 1
+        horizon = self.horizons.first(t, state.u, p)
         row = -1
-        for count, h, k in zip(horizon.counts[:last], horizon.lengths[:last], horizon.rows[:last], strict=True):
+        for count, h, k in zip(horizon.counts, horizon.lengths, horizon.rows, strict=True):
             if k != row:
                 wanted = horizon.u[k].copy()
                 wanted[self._commands] = u
@@ -219,9 +228,9 @@ class Shooting(ABC):
     def _expected(self, state: State, p: Array) -> _Prepared | None:
         """The linearisation prepared for this sample, unless state, network or the commands of others are not as expected."""
         ready = self._prepared
-        if ready is None or not np.array_equal(ready.p, p):
+        if ready is None or not _same(ready.p, p) or not _same(state.d, ready.d):
             return None
-        if not np.array_equal(state.u[self._others], ready.u[self._others]) or not np.array_equal(state.d, ready.d):
+        if not _same(state.u[self._others], ready.u[self._others]):
             return None
         reach = self.options.jump if ready.G_x.shape[2] else _SAME_STATE
         return ready if np.abs(state.x - ready.x).max(initial=0.0) <= reach else None
@@ -229,14 +238,19 @@ class Shooting(ABC):
     def _feedback(self, ready: _Prepared, state: State, t: float, u_last: Array) -> Solution:
         """One QP around what was prepared, corrected for the state."""
         y = ready.y + ready.G_x @ (state.x - ready.x) if ready.G_x.shape[2] else ready.y
-        at = Linearised(y, ready.G, self.problem.references(t))
+        at = Linearised(y, ready.G, self.problem.references(t), self._curvature)
         found = self.condensed.direction(at, ready.plan, u_last)
         if found is None:
             return Solution(Status.QP_FAILED, ready.plan, np.inf, 1, np.inf)
-        step, _ = found
-        plan = self.condensed.clipped(ready.plan + step)
-        cost = self.condensed.cost(y + ready.G @ step.ravel(), at.references, plan, u_last)
-        return Solution(Status.ITERATED, plan, cost, 1, float(np.abs(step).max()))
+        return self._taken(Status.ITERATED, at, ready.plan, found[0], u_last, 1)
+
+    def _taken(
+        self, status: Status, at: Linearised, plan: Array, step: Array, u_last: Array, iterations: int
+    ) -> Solution:
+        """The plan after a step that is taken on trust; its cost is to first order."""
+        plan = self.condensed.clipped(plan + step)
+        cost = self.condensed.cost(at.after(step), at.references, plan, u_last)
+        return Solution(status, plan, cost, iterations, float(np.abs(step).max()))
 
     def _first(self, plans: list[Array], state: State, horizon: Horizon) -> tuple[Array, Rollout | None]:
         """The first of these plans that the model can be stepped through."""
@@ -266,45 +280,54 @@ class Shooting(ABC):
 
         return sorted(plans, key=cost)
 
-    def _iterate(self, state: State, t: float, p: Array, u_last: Array, count: int) -> Solution:
+    def _iterate(self, state: State, t: float, p: Array, u_last: Array) -> Solution:
         """Gauss-Newton with a line search on the true cost."""
-        references = self.problem.references(t)
+        options, references = self.options, self.problem.references(t)
+        converge = options.mode == "converged" or self._plan is None
+        count = options.max_iterations if converge else options.jump_iterations
+        near = options.tolerance if converge else max(options.jump_tolerance, options.tolerance)
         horizon = self.horizons.at(t, state.u, p)
-        # A plan made on standby was never in force: it may begin further from the command in force than a move may go.
-        wanted = [np.tile(u_last, (self.problem.N_c, 1))]
-        if self._plan is not None:
-            wanted.insert(0, self.problem.shifted(self._plan))
-        starts = [self.condensed.reachable(plan, u_last) for plan in wanted]
-        hold = starts[-1]
-        if self.options.candidates:
-            starts += self._levels(self.options.candidates, u_last)
-            starts = self._cheapest_first(starts, state, horizon, u_last, t)
-        plan, rollout = self._first(starts, state, horizon)
+        plan, rollout = self._start(state, t, horizon, u_last)
         if rollout is None:
-            plan, rollout = self._first(self._levels(2, u_last), state, horizon)
-        if rollout is None:
-            return Solution(Status.PREDICTION_FAILED, hold, np.inf, 0, np.inf)
+            return self._failed(Status.PREDICTION_FAILED, u_last)
         cost = self.condensed.cost(rollout.y, references, plan, u_last)
         status, step, iteration = Status.ITERATED, np.inf, 0
         while iteration < count:
             iteration += 1
             assert rollout.dy is not None
-            found = self.condensed.direction(Linearised(rollout.y, rollout.dy, references), plan, u_last)
+            at = Linearised(rollout.y, rollout.dy, references)
+            found = self.condensed.direction(at, plan, u_last)
             if found is None:
                 status = Status.QP_FAILED if iteration == 1 else status
                 break
             direction, slope = found
             step = float(np.abs(direction).max())
-            if step <= self.options.tolerance:
+            if step <= options.tolerance:
                 status = Status.CONVERGED
                 break
-            better = self._search(state, horizon, plan, direction, u_last, references, (cost, slope))
+            if step <= near:
+                return self._taken(Status.ITERATED, at, plan, direction, u_last, iteration)
+            more = iteration < count
+            better = self._search(state, horizon, plan, direction, u_last, references, (cost, slope), derivatives=more)
             if better is None:
                 # No decrease can be had along a descent direction: converged to the rounding of the cost.
-                status = Status.CONVERGED if step <= np.sqrt(self.options.tolerance) else status
+                status = Status.CONVERGED if step <= np.sqrt(options.tolerance) else status
                 break
             plan, rollout, cost = better
         return Solution(status, plan, cost, iteration, step)
+
+    def _start(self, state: State, t: float, horizon: Horizon, u_last: Array) -> tuple[Array, Rollout | None]:
+        """Where the iteration begins, and the prediction there; ``None`` where nothing can be predicted."""
+        # A plan made on standby was never in force: it may begin further from the command in force than a move may go.
+        wanted = [np.tile(u_last, (self.problem.N_c, 1))]
+        if self._plan is not None:
+            wanted.insert(0, self.problem.shifted(self._plan))
+        starts = [self.condensed.reachable(plan, u_last) for plan in wanted]
+        if self.options.candidates:
+            starts += self._levels(self.options.candidates, u_last)
+            starts = self._cheapest_first(starts, state, horizon, u_last, t)
+        plan, rollout = self._first(starts, state, horizon)
+        return (plan, rollout) if rollout is not None else self._first(self._levels(2, u_last), state, horizon)
 
     def _search(
         self,
@@ -315,13 +338,15 @@ class Shooting(ABC):
         u_last: Array,
         references: Array,
         descent: tuple[float, float],
+        *,
+        derivatives: bool,
     ) -> tuple[Array, Rollout, float] | None:
         """Backtracking on the true cost; ``descent`` is its value and slope. ``None`` where no decrease is found."""
         cost, slope = descent
         scale = 1.0
         while scale >= SHORTEST:
             trial = self.condensed.clipped(plan + scale * direction)
-            rolled = self.predictor.roll(state, trial, horizon, derivatives=True)
+            rolled = self.predictor.roll(state, trial, horizon, derivatives=derivatives)
             if rolled is not None:
                 trial_cost = self.condensed.cost(rolled.y, references, trial, u_last)
                 if trial_cost <= cost + DECREASE * scale * min(slope, 0.0):
@@ -331,4 +356,9 @@ class Shooting(ABC):
 
 
 def _finite(state: State, p: Array) -> bool:
-    return all(bool(np.isfinite(values).all()) for values in (state.x, state.z, state.d, state.u, p))
+    # A sum of squares is finite only if every term is: cheaper than a look at each.
+    return all(math.isfinite(values.dot(values)) for values in (state.x, state.z, state.d, state.u, p))
+
+
+def _same(a: Array, b: Array) -> bool:
+    return a.shape == b.shape and bool((a == b).all())

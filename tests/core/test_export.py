@@ -25,6 +25,11 @@ SOFT = 'controller.mpc.soft=[{signal="i_fd", upper=1.5, weight=10.0}, {signal="v
 
 CASES = {
     "published": [],
+    "coarse steps, more iterations": [
+        "controller.mpc.N_p=10",
+        "controller.mpc.N_c=10",
+        "controller.mpc.options={step=0.025, jump_iterations=5, jump_tolerance=1e-4}",
+    ],
     "long": ["controller.mpc.N_p=20", "controller.mpc.N_c=20"],
     "rate": ["controller.mpc.N_p=10", "controller.mpc.N_c=5", "controller.mpc.du_max=0.3"],
     "blocks, growth, preview": [

@@ -144,9 +144,11 @@ def real_time_iteration(N: int, t_end: float, asked: Sequence[Any], passes: int)
 
     def once() -> None:
         solver.recall({"multipliers": np.zeros_like(solver.condensed.solver.memory())})
-        for sample, u_last in asked:
+        for k, (sample, u_last) in enumerate(asked):
             solution = feedback.measure(lambda s=sample, u=u_last: solver.solve(s, u))
-            whole.together(feedback, lambda s=solution: solver.prepare(s.u[0]))
+            # What was sent is what the loop that made the sequence sent.
+            sent = asked[k + 1][1] if k + 1 < len(asked) else solution.u[0]
+            whole.together(feedback, lambda u=sent: solver.prepare(u))
             for times in (feedback, whole):
                 times.commands.append(float(solution.u[0, 0]))
 

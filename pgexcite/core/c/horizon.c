@@ -46,7 +46,8 @@ static void add_piece(double duration, double h, int move, int end, Horizon *to)
     to->end[to->pieces++] = end;
 }
 
-static void horizon_at(double t, const double *u, const double *p, Horizon *to) {
+/* From t on, with these commands and parameters in force; each interval in this many steps. */
+static void horizon_at(double t, const double *u, const double *p, int steps, Horizon *to) {
     double here = t, last = t + ENDS[HORIZON - 1];
     int j, next = 0, until = N_KNOWN;
     to->pieces = 0;
@@ -56,7 +57,7 @@ static void horizon_at(double t, const double *u, const double *p, Horizon *to) 
     while (next < N_KNOWN && KNOWN_T[next] <= t + SAME_INSTANT) next++;
     while (until > next && KNOWN_T[until - 1] >= last - SAME_INSTANT) until--;
     for (j = 0; j < HORIZON; j++) {
-        double end = t + ENDS[j], h = INTERVALS[j] / FIRST_COUNT;
+        double end = t + ENDS[j], h = INTERVALS[j] / steps;
         for (; next < until && KNOWN_T[next] < end - SAME_INSTANT; next++) {
             add_piece(KNOWN_T[next] - here, h, SAMPLE_MOVE[j], 0, to);
             add_row(next, to);

@@ -38,8 +38,8 @@ void ${name}_prepare(const double *command) {
     if (!advance(&origin, origin_t, origin_p, command)) return;
     shift(plan, moved);
     reach(moved, command, prepared_plan);
-    horizon_at(origin_t + ENDS[0], origin.u, origin_p, &over);
-    if (!predict(&origin, &over, prepared_plan, &ready)) return;
+    horizon_at(origin_t + ENDS[0], origin.u, origin_p, FIRST_COUNT, &over);
+    if (!predict(&origin, &over, prepared_plan, 1, &ready)) return;
     expected = origin;
     memcpy(prepared_p, origin_p, sizeof prepared_p);
     prepared = 1;

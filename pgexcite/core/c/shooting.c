@@ -36,17 +36,18 @@ static int differ(const double *a, const double *b, int n) {
 #define TO_MOVES(at) ((at)->G + N_S * N_SELECTED)
 #define STRIDE (N_Q * N_SELECTED)
 
-static int predict(const Point *from, const Horizon *over, const double *moves, Prediction *to) {
+static int predict(const Point *from, const Horizon *over, const double *moves, int derivatives, Prediction *to) {
     static double x[AT_LEAST_1(N_X)], z[AT_LEAST_1(N_Z)], d[AT_LEAST_1(N_D)];
     static double dy[HORIZON * N_COLUMNS * N_SELECTED], dx[HORIZON * N_COLUMNS * AT_LEAST_1(N_X)];
     static double X[2 * (N_X + N_V) * AT_LEAST_1(N_X)];
     int done;
     memcpy(x, from->x, sizeof x); memcpy(z, from->z, sizeof z); memcpy(d, from->d, sizeof d);
-    memset(dy, 0, sizeof dy);
+    if (derivatives) memset(dy, 0, sizeof dy);
     done = pgexcite_rollout(RULE, over->pieces, over->count, over->length, over->move, over->row, over->end, COMMANDS,
-                            from->startup, x, z, d, over->p, over->u, moves, 1, to->y, dy, dx);
-    if (done != over->pieces || !all_finite(to->y, HORIZON * N_SELECTED) || !all_finite(dy, HORIZON * N_COLUMNS * N_SELECTED))
-        return 0;
+                            from->startup, x, z, d, over->p, over->u, moves, derivatives, to->y, dy, dx);
+    if (done != over->pieces || !all_finite(to->y, HORIZON * N_SELECTED)) return 0;
+    if (!derivatives) return 1;
+    if (!all_finite(dy, HORIZON * N_COLUMNS * N_SELECTED)) return 0;
     if (TRANSITION)
         pgexcite_condense(HORIZON, N_MOVES, SAMPLE_MOVE, dy, dx, X, to->G);
     else
@@ -65,22 +66,23 @@ static int settle_at(Point *at, const double *u, const double *p) {
 }
 
 static int step_on(Point *at, const double *p, double h, int count) {
-    static double rows_x[FIRST_COUNT * AT_LEAST_1(N_X)], rows_z[FIRST_COUNT * AT_LEAST_1(N_Z)];
-    static double rows_d[FIRST_COUNT * AT_LEAST_1(N_D)], rows_y[FIRST_COUNT * AT_LEAST_1(N_Y)];
-    for (; count > 0; count -= FIRST_COUNT) {
-        int n = count < FIRST_COUNT ? count : FIRST_COUNT;
+    static double rows_x[SAMPLE_STEPS * AT_LEAST_1(N_X)], rows_z[SAMPLE_STEPS * AT_LEAST_1(N_Z)];
+    static double rows_d[SAMPLE_STEPS * AT_LEAST_1(N_D)], rows_y[SAMPLE_STEPS * AT_LEAST_1(N_Y)];
+    for (; count > 0; count -= SAMPLE_STEPS) {
+        int n = count < SAMPLE_STEPS ? count : SAMPLE_STEPS;
         if (pgexcite_advance(RULE, h, n, &at->startup, at->x, at->z, at->d, at->u, p, rows_x, rows_z, rows_d, rows_y) != n) return 0;
     }
     return 1;
 }
 
-/* One sample under these commands, from t, with all that is known to happen by its end; p too is moved on. */
+/* One sample in the plant's own steps under these commands, from t, with all that is known to happen by its end; p too is moved
+   on. */
 static int advance(Point *at, double t, double *p, const double *commands) {
     static Horizon over;
     static double wanted[AT_LEAST_1(N_U)];
     const double *row_p = over.p;
     int j = 0, i, row = -1;
-    horizon_at(t, at->u, p, &over);
+    horizon_at(t, at->u, p, SAMPLE_STEPS, &over);
     do {
         if (over.row[j] != row) {
             int first = row < 0;
@@ -117,6 +119,17 @@ static int is_expected(const Point *at, const double *p) {
     return 1;
 }
 
+/* The plan after a step that is taken on trust; its cost is to first order. y comes in before the step and goes out after it. */
+static void take(const Prediction *at, const double *targets, const double *from, const double *step, const double *u_last, double *y,
+                 double *found, double *cost) {
+    int j, s, i;
+    for (j = 0; j < HORIZON; j++)
+        for (s = 0; s < N_SELECTED; s++)
+            for (i = 0; i < N_V; i++) y[j * N_SELECTED + s] += TO_MOVES(at)[j * STRIDE + i * N_SELECTED + s] * step[i];
+    for (i = 0; i < N_V; i++) found[i] = clipped(from[i] + step[i], i);
+    *cost = cost_of(y, targets, found, u_last);
+}
+
 /* One program around what was prepared, corrected for the state. */
 static int feedback(const double *x, const double *u_last, const double *targets, double *found, double *cost) {
     static double y[HORIZON * N_SELECTED], step[N_V];
@@ -129,11 +142,7 @@ static int feedback(const double *x, const double *u_last, const double *targets
             y[j * N_SELECTED + s] = value;
         }
     if (!direction_of(y, TO_MOVES(&ready), STRIDE, targets, prepared_plan, u_last, step, &slope)) return ${NAME}_QP_FAILED;
-    for (j = 0; j < HORIZON; j++)
-        for (s = 0; s < N_SELECTED; s++)
-            for (i = 0; i < N_V; i++) y[j * N_SELECTED + s] += TO_MOVES(&ready)[j * STRIDE + i * N_SELECTED + s] * step[i];
-    for (i = 0; i < N_V; i++) found[i] = clipped(prepared_plan[i] + step[i], i);
-    *cost = cost_of(y, targets, found, u_last);
+    take(&ready, targets, prepared_plan, step, u_last, y, found, cost);
     return ${NAME}_ITERATED;
 }
 
@@ -147,21 +156,21 @@ static int begin(const Point *at, const Horizon *over, const double *u_last, dou
         else
             for (i = 0; i < N_V; i++) wanted[i] = k == 1 ? u_last[i % N_COMMANDS] : k == 2 ? UPPER[i] : LOWER[i];
         reach(wanted, u_last, from);
-        if (predict(at, over, from, to)) return 1;
+        if (predict(at, over, from, 1, to)) return 1;
     }
     return 0;
 }
 
-/* Gauss-Newton with a line search on the true cost. */
+/* Gauss-Newton with a line search on the true cost. A step of no more than `near` is the last, and taken on trust. */
 static int iterate(const Point *at, double t, const double *p, const double *u_last, const double *targets, int count,
-                   double *found, double *cost, int *iterations) {
+                   double near, double *found, double *cost, int *iterations) {
     static Prediction first, second;
     static Horizon over;
     static double trial[N_V], step[N_V];
     Prediction *here = &first, *there = &second, *swap;
     double slope, length, scale, trial_cost = 0;
     int i, status = ${NAME}_ITERATED, better;
-    horizon_at(t, at->u, p, &over);
+    horizon_at(t, at->u, p, FIRST_COUNT, &over);
     if (!begin(at, &over, u_last, found, here)) return ${NAME}_PREDICTION_FAILED;
     *cost = cost_of(here->y, targets, found, u_last);
     for (*iterations = 0; *iterations < count;) {
@@ -170,10 +179,14 @@ static int iterate(const Point *at, double t, const double *p, const double *u_l
             return *iterations == 1 ? ${NAME}_QP_FAILED : status;
         length = largest(step, N_V);
         if (length <= PLAN_TOLERANCE) return ${NAME}_CONVERGED;
+        if (length <= near) {
+            take(here, targets, found, step, u_last, here->y, found, cost);
+            return status;
+        }
         better = 0;
         for (scale = 1; !better && scale >= SHORTEST; scale /= 2) {
             for (i = 0; i < N_V; i++) trial[i] = clipped(found[i] + scale * step[i], i);
-            if (!predict(at, &over, trial, there)) continue;
+            if (!predict(at, &over, trial, *iterations < count, there)) continue;
             trial_cost = cost_of(there->y, targets, trial, u_last);
             better = trial_cost <= *cost + DECREASE * scale * (slope < 0 ? slope : 0);
         }
@@ -189,7 +202,8 @@ static int iterate(const Point *at, double t, const double *p, const double *u_l
 static int plan_from(const Point *at, double t, const double *p, const double *u_last, double *found, double *cost,
                      int *iterations) {
     static double targets[HORIZON * N_TRACKED];
-    int status, count = CONVERGE || !has_plan ? MAX_PLAN_ITERATIONS : JUMP_ITERATIONS;
+    int status, converge = CONVERGE || !has_plan, count = converge ? MAX_PLAN_ITERATIONS : JUMP_ITERATIONS;
+    double near = converge ? PLAN_TOLERANCE : JUMP_TOLERANCE;
     origin = *at;
     memcpy(origin_p, p, sizeof origin_p);
     origin_t = t;
@@ -204,7 +218,7 @@ static int plan_from(const Point *at, double t, const double *p, const double *u
         *iterations = 1;
         status = feedback(origin.x, u_last, targets, found, cost);
     } else {
-        status = iterate(&origin, origin_t, origin_p, u_last, targets, count, found, cost, iterations);
+        status = iterate(&origin, origin_t, origin_p, u_last, targets, count, near, found, cost, iterations);
     }
     if (status <= ${NAME}_ITERATED) {
         memcpy(plan, found, sizeof plan);

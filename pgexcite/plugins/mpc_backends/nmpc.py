@@ -41,8 +41,11 @@ class NMPC(BaseModel):
 
     mode: Literal["rti", "converged"] = par("rti", "-", "real-time iteration, or every plan converged")
     max_iterations: int = par(20, "-", "QPs solved for one plan at the most, when converging", ge=1)
-    jump_iterations: int = par(4, "-", "QPs solved for one plan where the state is not what was expected", ge=1)
+    jump_iterations: int = par(2, "-", "QPs solved for one plan where the state is not what was expected", ge=1)
     jump: float = par(1e-3, "pu", "difference of a state from what was expected that counts as a jump", gt=0)
+    jump_tolerance: float = par(
+        1e-3, "pu", "change of a command at which a plan made after a jump is near enough", gt=0
+    )
     tolerance: float = par(1e-6, "pu", "largest change of a command at which a plan has converged", gt=0)
     candidates: int = par(0, "-", "constant plans between the bounds tried before iterating; 0 tries none", ge=0)
     mismatch: Mapping[str, float] = Field(
@@ -66,6 +69,7 @@ class NMPC(BaseModel):
             max_iterations=self.max_iterations,
             jump_iterations=self.jump_iterations,
             jump=self.jump,
+            jump_tolerance=self.jump_tolerance,
             tolerance=self.tolerance,
             exact=True,
             candidates=self.candidates,

@@ -23,10 +23,10 @@ FAULT = Fault(type="fault", t=0.2, bus="HV", R=0.02, duration=0.1)
 COMMAND = "unit.G2.exciter.e_fd_ref"
 
 
-def run(t_end=1.5, system=None, **options):
+def run(t_end=1.5, system=None, compiled="never", **options):
     sim = Simulation(
         system or kobbelv(),
-        Settings(t_end, 0.005, "tr_bdf2", "never"),
+        Settings(t_end, 0.005, "tr_bdf2", compiled),
         FAULT.changes(),
         {"mpc": MPC(**({"unit": "G2"} | options))},
     )
@@ -198,6 +198,53 @@ def test_real_time_iteration_costs_little_against_converged_plans():
     costs = [sim.result().controllers["mpc"].cost for sim in (quick, full)]
     assert costs[0] == pytest.approx(costs[1], rel=1e-3)  # measured 1.2e-7
     assert quick.trace()["controller.mpc.iterations"].sum() < full.trace()["controller.mpc.iterations"].sum()
+
+
+@pytest.mark.parametrize("horizon", [{"N_p": 5}, {"N_p": 20, "N_c": 20}])
+@pytest.mark.parametrize("step", [0.025, 0.05])
+def test_coarser_prediction_steps_cost_little_and_expect_the_plants_own_states(horizon, step):
+    """The state at the next sample is stepped as the plant steps: one QP a sample, but at the start and where the fault moves."""
+    converged = {"mode": "converged", "tolerance": 1e-8, "max_iterations": 100}
+    coarse, full = (run(2.0, compiled="auto", options=chosen, **horizon) for chosen in ({"step": step}, converged))
+    costs = [sim.result().controllers["mpc"].cost for sim in (coarse, full)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-4)  # measured 3e-8 to 1.3e-5
+    trace = coarse.trace()
+    iterations = trace["controller.mpc.iterations"]
+    assert (iterations[[np.searchsorted(trace.t, t + 1e-9) for t in np.arange(0.35, 2.0, 0.05)]] == 1).all()
+    off = np.abs(np.diff([sent(sim) for sim in (coarse, full)], axis=0)).max()
+    assert 1e-3 < off < {0.025: 0.01, 0.05: 0.04}[step]  # measured 6e-3 and 2.6e-2 pu
+
+
+def sent(sim):
+    """Commands in force in each sample."""
+    trace = sim.trace()
+    return trace[COMMAND][np.searchsorted(trace.t, np.arange(0.05, trace.t[-1] + 1e-9, 0.05) - 1e-9)]
+
+
+MILD = {
+    "grid": [Change(0.5, {}, "grid voltage rises", {"infinite_bus.grid.v": 0.03})],
+    "far fault": Fault(type="fault", t=0.5, bus="HV", R=0.3, duration=0.1).changes(),
+}
+
+
+@pytest.mark.parametrize("case", MILD)
+@pytest.mark.parametrize("count", [1, 2])
+def test_after_a_jump_a_program_or_two_are_enough(case, count):
+    """Nothing saturates here for long, so that the first command is the optimum's and not a bound."""
+    runs = []
+    for options in ({"jump_iterations": count}, {"mode": "converged", "tolerance": 1e-8, "max_iterations": 100}):
+        sim = Simulation(
+            kobbelv(),
+            Settings(1.5, 0.005, "tr_bdf2", "auto"),
+            MILD[case],
+            {"mpc": MPC(unit="G2", N_p=20, N_c=20, options=options)},
+        )
+        sim.run()
+        runs.append(sim)
+    costs = [sim.result().controllers["mpc"].cost for sim in runs]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-3)  # measured 2e-5 and 5e-7
+    off = np.abs(np.diff([sent(sim) for sim in runs], axis=0)).max()
+    assert off < {1: 0.05, 2: 1e-3}[count]  # measured 2e-2 and 3e-4 pu, of 4 pu
 
 
 def test_known_disturbance_and_computing_delay_together():
