@@ -299,13 +299,13 @@ static int ukf_propagate(void) {
 
 /* What is expected, how surprising z is, and the change of the network that takes: 0 for none, -1 where none
    explains it, else which jump. Returns 0 where a covariance is none. */
-static int ukf_judge(const double *z, Expectation *expected, double *surprise, int *change) {
+static int ukf_judge(const double *z, Expectation *now, double *surprise, int *change) {
     static double x[UKF_N], P[UKF_N * UKF_N], sigmas[UKF_POINTS * UKF_N];
     static Expectation other;
     double left;
     int k;
-    ukf_expect(ukf_sigmas, expected);
-    *surprise = ukf_surprise(expected, z);
+    ukf_expect(ukf_sigmas, now);
+    *surprise = ukf_surprise(now, z);
     *change = 0;
     ukf_mean += UKF_FORGET * ((UKF_LIMIT < *surprise ? UKF_LIMIT : *surprise) - ukf_mean);
     if (*surprise <= UKF_LIMIT && ukf_mean <= UKF_LIMIT_MEAN) {
@@ -324,7 +324,7 @@ static int ukf_judge(const double *z, Expectation *expected, double *surprise, i
             memcpy(ukf_x, x, sizeof ukf_x); memcpy(ukf_P, P, sizeof ukf_P);
             ukf_held = 0;
             ukf_since = 0; ukf_moving = UKF_HOLD_AFTER; ukf_mean = UKF_M;
-            *expected = other;
+            *now = other;
             *surprise = left;
             *change = k + 1;
             return 1;
@@ -334,9 +334,9 @@ static int ukf_judge(const double *z, Expectation *expected, double *surprise, i
     return 1;
 }
 
-static void ukf_correct(const Expectation *expected, const double *z) {
+static void ukf_correct(const Expectation *now, const double *z) {
     double x_s = ukf_x[UKF_X_S];
-    ukf_update(expected, z);
+    ukf_update(now, z);
     ukf_keep(x_s);
     if (fabs(ukf_slip(ukf_x)) > UKF_SWING) {
         ukf_moving = ukf_larger(ukf_moving, UKF_SETTLED_AFTER);
