@@ -18,7 +18,7 @@ from pgexcite.core.equivalent import TERMINALS, Equivalent
 from pgexcite.core.errors import ConfigError, Problem, RegistryError
 from pgexcite.core.estimation import Estimate, Estimator, Observer, Writable
 from pgexcite.core.export import Input, Parts
-from pgexcite.core.export.shooting import DELAYED, LOOPS, planning, refuse
+from pgexcite.core.export.shooting import DELAYED, LOOPS, planning, refuse, tolerance
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solution, Solver
@@ -180,7 +180,7 @@ class _Equivalent(Shooting):
             constants={**constants, **estimator.constants, **self._constants(len(seen))},
             arrays={**arrays, **estimator.arrays, **self._arrays()},
             templates=(*(loop(file) for file in ("horizon.c", "shooting.c")), estimator.text, _TEXT),
-            tolerance=1e-6,  # measured 1e-12 to 1e-8
+            tolerance=tolerance(self),
             told=estimator.told,
         )
 
