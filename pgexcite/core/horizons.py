@@ -129,6 +129,10 @@ class Horizons:
                 u, p = self._changed(u, p, change)
         return u, p
 
+    def changes_at(self, t: float) -> bool:
+        """Whether a known change takes place at ``t``."""
+        return any(abs(self.instant(change) - t) <= _SAME_INSTANT for change in self.problem.known)
+
     def instant(self, change: Change) -> float:
         """When a known change takes place, s."""
         return float(np.ceil(change.t / self.grid - 1e-6) * self.grid)

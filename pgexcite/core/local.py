@@ -91,6 +91,16 @@ class LocalModel:
                 slopes.append(slope)
         return np.array(ys), np.array(slopes)
 
+    def outputs(self, x: Array, commands: Array, u: Array, p: Array) -> tuple[Array, Array] | None:
+        """Outputs and their derivatives to the states at ``x`` under ``commands``, with other commands and parameters in force."""
+        wanted = u.copy()
+        wanted[self._commands] = self.point.u[self._commands]
+        start = self._kernel.settle(self.point.with_(u=wanted), p)
+        if start is None:
+            return None
+        y, C, D = self._predictor.outputs(start, p)
+        return y + C @ (x - start.x) + D @ (commands - wanted[self._commands]), C
+
     def _piece(self, horizon: Horizon, k: int) -> Transition | None:
         row = horizon.rows[k]
         # A horizon's lengths are differences of times: without rounding no two of them were the same.

@@ -101,6 +101,23 @@ def test_away_from_rest_the_first_sample_is_exact_and_pieces_add_up():
     assert np.abs(local.predict(split, start.x, plan, np.zeros(start.x.size))[0][0] - two.y).max() < 1e-12
 
 
+def test_outputs_in_another_network_are_those_after_the_change():
+    """A fault at the point itself, and states a little beside it."""
+    initial, kernel, commands, outputs, predictor = build()
+    start = away_from_rest(initial, kernel)
+    local = LocalModel(kernel, commands, predictor, start)
+    p = initial.p.copy()
+    p[[initial.model.position("p", f"bus.HV.fault_{name}") for name in ("status", "R")]] = 1.0, 0.02
+    u = start.u.copy()
+    u[commands[0]] += 0.3
+    for beside, off in ((0.0, 1e-12), (1e-3, 1e-5)):  # measured below 1e-14, and 2e-6: second order
+        x = start.x + beside * np.sign(np.sin(np.arange(start.x.size) + 1.0)) * kernel.mass.astype(bool)
+        exact = kernel.outputs(kernel.settle(start.with_(x=x, u=u), p), p)[outputs]
+        y, C = local.outputs(x, u[commands], start.u, p)
+        assert np.abs(y - exact).max() < off
+        assert C.shape == (len(outputs), start.x.size)
+
+
 def test_a_push_moves_the_states_at_the_end_of_every_sample():
     initial, kernel, commands, _, predictor = build()
     local = LocalModel(kernel, commands, predictor, kernel.settle(initial.state, initial.p))

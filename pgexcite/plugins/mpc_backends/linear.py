@@ -245,6 +245,10 @@ class _Linear:
                 return False
             self.filter.predict(step)
             y, C = step.y, step.C
+            if self._horizons.changes_at(sample.t):
+                # Measured after what is known to have changed at this instant; without it the change would count twice.
+                after = self._horizons.until(sample.t, self._u_0, self._p_0)
+                y, C = self._local.outputs(step.x, u - self._u_bias, *after) or (y, C)
         measured = np.array([sample.measured[path] for path in self._measured])
         if np.nanmax(np.abs(measured), initial=0.0) > _ABSURD:
             return False

@@ -178,6 +178,16 @@ def test_a_limit_of_the_model_does_not_lock_the_command():
     assert deviation(sim, 5.0) < 2e-3  # measured 4e-4
 
 
+def test_a_known_change_at_a_sample_is_expected_in_what_is_measured_there():
+    """Both changes of the fault fall on samples: the measurements are of the network after them, and surprise nobody."""
+    surprised, known = (run(FAULT, t_end=1.0, disturbance_known=flag).trace() for flag in (False, True))
+    innovations = [trace["controller.mpc.innovation"][trace.t < 0.5].max() for trace in (surprised, known)]
+    assert innovations[0] > 2.0  # measured 2.16 pu
+    assert innovations[1] < 0.1  # measured 0.045
+    cleared = (known.t > 0.3) & (known.t < 0.4)
+    assert known[COMMAND][cleared].min() > 2.0  # measured 2.2: it goes on supporting the voltage
+
+
 def test_a_known_fault_costs_less():
     surprised, known = (run(FAULT, t_end=3.0, disturbance_known=flag) for flag in (False, True))
     costs = [sim.result().controllers["mpc"].cost for sim in (surprised, known)]
