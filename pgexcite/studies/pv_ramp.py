@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.events import Change, LoadStep
+from pgexcite.core.events import Change
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.system import System
@@ -80,11 +80,11 @@ def pv_by_ramp(
     """
     pace = pace or Pace()
     device = system.device(f"load.{load}")
-    demand = (-(device.schedule.P or 0.0), -(device.schedule.Q or 0.0))
+    demand = {f"load.{load}.{name}": -(getattr(device.schedule, name) or 0.0) for name in ("P", "Q")}
 
-    def step(t: float, share: float) -> tuple[Change, ...]:
-        P, Q = demand
-        return LoadStep(type="load_step", t=t, load=load, dP=P * share, dQ=Q * share).changes()
+    def step(t: float, share: float) -> Change:
+        increments = {path: power * share for path, power in demand.items()}
+        return Change(t, {}, f"load {load} changes by {share:+.3g} of its demand", increments)
 
     count = int(np.log(pace.heavy / pace.light) / np.log(pace.growth))
     shares = pace.light * pace.growth ** np.arange(count + 1)
@@ -93,7 +93,7 @@ def pv_by_ramp(
     simulation = Simulation(
         system,
         replace(settings, t_end=pace.begins + pace.every * count),
-        sorted([*changes, *(change for step in steps for change in step)], key=lambda change: change.t),
+        sorted([*changes, *steps], key=lambda change: change.t),
     )
     outcome, trace = simulation.run(), simulation.trace()
     ends = np.searchsorted(trace.t, np.arange(pace.begins, outcome.t, pace.every) - 1e-6) - 1
