@@ -23,6 +23,10 @@ TRANSFER = [
 
 SOFT = 'controller.mpc.soft=[{signal="i_fd", upper=1.5, weight=10.0}, {signal="v_t", lower=0.95, upper=1.01, weight=100.0}]'
 
+STEPS = """event=[{type="set", path="unit.G2.governor.p_m", t=1.03, step=-0.1},
+    {type="set", path="infinite_bus.grid.v", t=1.5, value=0.92},
+    {type="fault", t=2.0, bus="HV", R=0.02, duration=0.1}]"""
+
 CASES = {
     "published": [],
     "coarse steps, more iterations": [
@@ -50,6 +54,13 @@ CASES = {
         "controller.mpc.delayed=true",
         "controller.mpc.N_p=10",
         "controller.mpc.growth=1.3",
+    ],
+    "known set-points, within samples, delayed": [
+        "controller.mpc.disturbance_known=true",
+        "controller.mpc.delayed=true",
+        "controller.mpc.N_p=10",
+        "controller.mpc.N_c=3",
+        STEPS,
     ],
     "backward Euler": ["simulation.rule=backward_euler", "controller.mpc.N_c=2"],
 }
