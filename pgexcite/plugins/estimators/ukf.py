@@ -34,12 +34,18 @@ _FORGIVE = 0.1
 
 _SWING = 4.0
 """Deviation of the speed that counts as a swing, in standard deviations of its measurement."""
-_MODERATE: Jump = (0.1, 0.5, 0.05)
+_MODERATE: Jump = (0.1, 0.3, 0.05)
 """A line trips, a fault is cleared."""
 _SEVERE: Jump = (1.0, 0.1, 0.6)
 """A fault."""
 _JUMPS = (_MODERATE, _SEVERE)
 """In the order in which they are tried."""
+_STEADY = 0.3
+"""Share of its random walk that the torque keeps right after a change: a swing is faster than a turbine."""
+_LATE_FLUX = 3e-3
+"""What a change somewhere within the last sample adds to the deviation of the fluxes, which do not jump, pu."""
+_LATE_OMEGA = 2.0
+"""The same of the speed, in standard deviations of its measurement."""
 
 _TOLD = (
     "x_s",
@@ -86,12 +92,12 @@ class UKF(BaseModel):
     x_s_max: float = par(2.0, "pu", "highest reactance that makes sense", gt=0)
     v_bus_min: float = par(0.05, "pu", "lowest voltage of the equivalent bus that makes sense", gt=0)
     v_bus_max: float = par(1.5, "pu", "highest voltage of the equivalent bus that makes sense", gt=0)
-    share: float = par(0.03, "-", "share of a state's change in a sample that the model may have wrong", ge=0)
+    share: float = par(0.01, "-", "share of a state's change in a sample that the model may have wrong", ge=0)
     walk_flux: float = par(5e-3, "pu/sqrt(s)", "random walk of the rotor's fluxes", gt=0)
-    walk_omega: float = par(1e-4, "pu/sqrt(s)", "random walk of the speed", gt=0)
+    walk_omega: float = par(3e-5, "pu/sqrt(s)", "random walk of the speed", gt=0)
     walk_delta: float = par(5e-3, "rad/sqrt(s)", "random walk of the rotor angle", gt=0)
     walk_p_m: float = par(5e-3, "pu/sqrt(s)", "random walk of the mechanical torque", gt=0)
-    walk_frequency: float = par(2e-4, "pu/sqrt(s)", "random walk of the equivalent bus's frequency", gt=0)
+    walk_frequency: float = par(5e-5, "pu/sqrt(s)", "random walk of the equivalent bus's frequency", gt=0)
     walk_x_s: float = par(2e-3, "pu/sqrt(s)", "random walk of x_s while anything moves", gt=0)
     walk_v_bus: float = par(5e-4, "pu/sqrt(s)", "random walk of v_bus", gt=0)
     gate: float = par(
@@ -200,6 +206,8 @@ class _Tracker:
         kalman, options = self._kalman, self.options
         before = kalman.x
         walk = self._walk.copy()
+        if self._since < options.hold_after:
+            walk[self.layout.p_m, self.layout.p_m] *= _STEADY**2
         walk[self._bus, self._bus] = wandered(before[self._bus], options.walk_delta, options.walk_v_bus)
         if not self._network.held:
             walk[self.layout.x_s, self.layout.x_s] = options.walk_x_s**2
@@ -243,8 +251,7 @@ class _Tracker:
 
     def _jolt(self) -> Array:
         """What a change of the network does to the variances of the rotor's states, beyond what the model says."""
-        options = self.options
-        return np.where(self._fluxes, options.noise**2, 4 * options.noise_omega**2)
+        return np.asarray(np.where(self._fluxes, _LATE_FLUX, _LATE_OMEGA * self.options.noise_omega) ** 2)
 
     def _correct(self, expected: Expectation, z: Array) -> None:
         kalman, network, options = self._kalman, self._network, self.options
@@ -335,6 +342,7 @@ class _Tracker:
             "swing": _SWING * options.noise_omega,
             "held": HELD,
             "lowest": LOWEST,
+            "steady": _STEADY**2,
             "start_aside": float(first["network:aside"]),
             "told": len(_TOLD),
             "n_jumps": len(_JUMPS),

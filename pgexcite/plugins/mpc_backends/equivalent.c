@@ -3,16 +3,17 @@
    Goes below shooting.c and an estimator. The equivalent's field voltage is OFFSET above the plant's: commands and bounds are the
    equivalent's inside, the plant's outside. */
 
-/* The field voltage as last seen and as sent last, pu of the plant. */
-static double field_seen, field_sent;
+/* The field voltage as seen in the last two samples and as sent last, pu of the plant. */
+static double field_before, field_seen, field_sent;
 static int was_in_charge;
 
 /* The equivalent's field voltage since the last sample, of which `field` was measured at the end. */
 static double since_last(int whole, double field) {
-    double before = field_seen;
+    double first = field_before, before = field_seen;
+    field_before = field_seen;
     field_seen = whole ? field : field_sent;
-    /* In charge it was constant. A regulator moved it; its two ends are known. */
-    return (was_in_charge ? field_seen : (before + field_seen) / 2) + OFFSET;
+    /* In charge it was constant. A regulator moved it: the mean of the parabola through the last three. */
+    return (was_in_charge ? field_seen : (5 * field_seen + 8 * before - first) / 12) + OFFSET;
 }
 
 /* Keep what is in force until the next sample. */
@@ -39,7 +40,7 @@ static int locate(Point *at, double *p) {
 
 void ${name}_reset(void) {
     has_plan = prepared = has_origin = 0;
-    field_seen = field_sent = FIELD_0;
+    field_before = field_seen = field_sent = FIELD_0;
     was_in_charge = 0;
     ladder_reset();
     estimator_reset();

@@ -96,7 +96,7 @@ class _Equivalent(Shooting):
         super().__init__(self._equivalent.kernel, own, shooting, rule="tr_bdf2", h=h, grid=surroundings.h)
         self._offset = self._equivalent.offset
         self._bounds = float(problem.u_min[0]), float(problem.u_max[0])
-        self._seen = self._sent = np.array([surroundings.y_0[self._field]])
+        self._before = self._seen = self._sent = np.array([surroundings.y_0[self._field]])
         self._in_charge = False
         self._told: Mapping[str, float] = {}
 
@@ -116,13 +116,14 @@ class _Equivalent(Shooting):
 
     def memory(self) -> Mapping[str, Array]:
         """Plan, estimate, and the field voltages seen and sent last."""
-        own = as_arrays({"seen": self._seen, "sent": self._sent, "in_charge": self._in_charge})
+        own = as_arrays({"before": self._before, "seen": self._seen, "sent": self._sent, "in_charge": self._in_charge})
         return {**super().memory(), **own, **{f"observer:{key}": v for key, v in self._observer.memory().items()}}
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
         super().recall(memory)
-        self._seen, self._sent, self._in_charge = memory["seen"], memory["sent"], bool(memory["in_charge"] > 0)
+        self._before, self._seen, self._sent = memory["before"], memory["seen"], memory["sent"]
+        self._in_charge = bool(memory["in_charge"] > 0)
         start = "observer:"
         self._observer.recall({k.removeprefix(start): v for k, v in memory.items() if k.startswith(start)})
 
@@ -140,9 +141,10 @@ class _Equivalent(Shooting):
 
     def _since_last(self, field: Array | None) -> float:
         """The equivalent's field voltage since the last sample, of which ``field`` was measured at the end."""
-        before, self._seen = self._seen, self._sent if field is None else field
-        # In charge it was constant. A regulator moved it; its two ends are known.
-        mean = self._seen if self._in_charge else (before + self._seen) / 2
+        first, before, self._before = self._before, self._seen, self._seen
+        self._seen = self._sent if field is None else field
+        # In charge it was constant. A regulator moved it: the mean of the parabola through the last three.
+        mean = self._seen if self._in_charge else (5 * self._seen + 8 * before - first) / 12
         return float(mean[0]) + self._offset
 
     def _settled(self, t: float, estimate: Estimate) -> State | None:
