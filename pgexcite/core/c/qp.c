@@ -7,6 +7,8 @@
    A row that gives 0 is hard. The slack of one that gives is its multiplier times what it gives, and is no variable: it has a
    direction of its own, so all it does is to add what the row gives to the row's place on the diagonal of the Gram matrix.
 
+   A program without rows is tried by block principal pivoting first, as pgexcite.core.qp does: a few small factorisations.
+
    Goes below dense.c. Expects N_V variables and N_ROWS rows. */
 
 #include <math.h>
@@ -15,6 +17,8 @@
 #define QP_BOUNDED (N_V + N_ROWS)
 #define QP_SPACE (QP_BOUNDED + 1)
 #define QP_MAX_ITERATIONS (10 * QP_BOUNDED + 50)
+#define QP_MAX_EXCHANGES 20
+#define QP_PATIENCE 3
 
 typedef struct {
     const double *H, *g;
@@ -146,11 +150,82 @@ static int qp_add(const Program *of, int chosen, double margin, double *x, int *
     }
 }
 
+/* Minimises over the variables on no side, the others at the bound of their side; 0 where H is not positive definite there. */
+static int qp_minimise(const Program *of, const int *side, double *x) {
+    static double A[N_V * N_V], r[N_V];
+    int index[N_V], n = 0, a, b, i, k;
+    for (i = 0; i < N_V; i++) {
+        if (side[i])
+            x[i] = side[i] > 0 ? of->upper[i] : of->lower[i];
+        else
+            index[n++] = i;
+    }
+    for (a = 0; a < n; a++) {
+        i = index[a];
+        r[a] = -of->g[i];
+        for (k = 0; k < N_V; k++)
+            if (side[k]) r[a] -= of->H[i * N_V + k] * x[k];
+        for (b = 0; b <= a; b++) A[a * n + b] = of->H[i * N_V + index[b]];
+    }
+    if (!cholesky(A, n)) return 0;
+    forward(A, n, r);
+    backward(A, n, r);
+    for (a = 0; a < n; a++) x[index[a]] = r[a];
+    return 1;
+}
+
+/* Block principal pivoting for bounds alone: all variables on a wrong side change it at once, while that makes them fewer; else the
+   last of them alone. 0 where the active set is not found in a few exchanges. */
+static int qp_pivot(const Program *of, double *x) {
+    int side[N_V], wrong[N_V], fewest = N_V + 1, patience = QP_PATIENCE, k, i, j;
+    double scale = 1;
+    memset(side, 0, sizeof side);
+    for (i = 0; i < N_V; i++) {
+        if (!(of->lower[i] <= of->upper[i])) return 0;
+        if (fabs(of->g[i]) > scale) scale = fabs(of->g[i]);
+    }
+    for (k = 0; k < QP_MAX_EXCHANGES; k++) {
+        int count = 0, last = 0;
+        if (!qp_minimise(of, side, x)) return 0;
+        for (i = 0; i < N_V; i++) {
+            double slope = -of->g[i];
+            for (j = 0; j < N_V; j++) slope -= of->H[i * N_V + j] * x[j];
+            if (!side[i] && !(fabs(slope) <= 1e-9 * scale)) return 0;
+            wrong[i] = side[i] ? side[i] * slope < 0 : x[i] > of->upper[i] + 1e-12 || x[i] < of->lower[i] - 1e-12;
+            count += wrong[i];
+            if (wrong[i]) last = i;
+        }
+        if (!count) return 1;
+        if (count < fewest) {
+            fewest = count;
+            patience = QP_PATIENCE;
+        } else if (patience-- <= 0) {
+            memset(wrong, 0, sizeof wrong);
+            wrong[last] = 1;
+        }
+        for (i = 0; i < N_V; i++)
+            if (wrong[i]) side[i] = side[i] ? 0 : x[i] > of->upper[i] ? 1 : -1;
+    }
+    return 0;
+}
+
+/* Within the bounds, past rounding; 0 where it is not finite. */
+static int qp_inside(const Program *of, double *x) {
+    int i;
+    for (i = 0; i < N_V; i++) {
+        if (x[i] < of->lower[i]) x[i] = of->lower[i];
+        if (x[i] > of->upper[i]) x[i] = of->upper[i];
+        if (x[i] - x[i] != 0) return 0;
+    }
+    return 1;
+}
+
 /* Returns 1 with the minimiser in x; 0 where there is none, H is not positive definite, or the cap was reached. */
 static int qp_solve(const Program *of, double *x) {
     static double free_x[N_V];
     double margin;
     int i, k, iteration = 0, chosen;
+    if (!N_ROWS && qp_pivot(of, x)) return qp_inside(of, x);
     memcpy(qp_L, of->H, sizeof qp_L);
     if (!cholesky(qp_L, N_V)) return 0;
     for (i = 0; i < N_V; i++) x[i] = -of->g[i];
@@ -169,11 +244,6 @@ static int qp_solve(const Program *of, double *x) {
         for (k = 0; k < qp_q; k++) x[i] += qp_r[k] * qp_W[k * N_V + i];
     }
     backward(qp_L, N_V, x);
-    for (i = 0; i < N_V; i++) {
-        x[i] += free_x[i];
-        if (x[i] < of->lower[i]) x[i] = of->lower[i];
-        if (x[i] > of->upper[i]) x[i] = of->upper[i];
-        if (x[i] - x[i] != 0) return 0;
-    }
-    return 1;
+    for (i = 0; i < N_V; i++) x[i] += free_x[i];
+    return qp_inside(of, x);
 }
