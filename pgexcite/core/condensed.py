@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +60,19 @@ class Linearised:
     references: Array
     curvature: Curvature | None = None
 
-    def after(self, step: Array) -> Array:
-        """Outputs after a step of the plan, to first order, shape ``(N_p, n_y)``."""
-        flat: Array = self.G.reshape(-1, self.G.shape[2]) @ step.ravel()
-        return self.y + flat.reshape(self.y.shape)
+
+class Direction(NamedTuple):
+    """A program's step from a plan.
+
+    Attributes:
+        step: of the commands, shape ``(N_c, n_u)``.
+        slope: of the cost along it, at the plan.
+        cost: after it, to first order of the prediction.
+    """
+
+    step: Array
+    slope: float
+    cost: float
 
 
 class Condensed:
@@ -124,11 +133,10 @@ class Condensed:
         errors, moves = self._errors(y, references), self._moves(plan, u_last)
         total = np.vdot(errors * errors, self._weights) + (self._R * moves) @ moves
         if self._n_soft:
-            total += np.sum(self._soft_weight * self._excess(y) ** 2)
+            total += np.sum(self._soft_weight * self._excess(y[:, self._n_tracked :]) ** 2)
         return float(total)
 
-    def _excess(self, y: Array) -> Array:
-        soft = y[:, self._n_tracked :]
+    def _excess(self, soft: Array) -> Array:
         return np.maximum(soft - self._soft_upper, 0.0) + np.maximum(self._soft_lower - soft, 0.0)
 
     def curvature(self, G: Array) -> Curvature:
@@ -137,26 +145,28 @@ class Condensed:
         weighted = J.T * self._twice
         return Curvature(weighted, weighted @ J + self._move_hessian)
 
-    def quadratic(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, Array]:
-        """Gauss-Newton Hessian and gradient of the tracked cost in the plan, shapes ``(n, n)`` and ``(n,)``; no soft bounds."""
+    def quadratic(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, Array, float]:
+        """The tracked cost around a plan, no soft bounds: Hessian (Gauss-Newton), gradient and value."""
         shared = at.curvature or self.curvature(at.G)
-        g = shared.weighted @ self._errors(at.y, at.references).ravel()
-        moved = 2 * self._R * self._moves(plan, u_last)
-        g += moved
-        g[: -u_last.size] -= moved[u_last.size :]
-        return shared.H, g
+        errors, moves = self._errors(at.y, at.references).ravel(), self._moves(plan, u_last)
+        weighted = self._R * moves
+        value = 0.5 * float((errors * errors) @ self._twice) + float(weighted @ moves)
+        g = shared.weighted @ errors
+        weighted *= 2
+        g += weighted
+        g[: -u_last.size] -= weighted[u_last.size :]
+        return shared.H, g, value
 
-    def direction(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, float] | None:
-        """The program's step from a plan, shape ``(N_c, n_u)``, and its slope of the cost; ``None`` where it was not solved."""
-        H, g = self.quadratic(at, plan, u_last)
-        slope_of = g
+    def direction(self, at: Linearised, plan: Array, u_last: Array) -> Direction | None:
+        """The program's step from a plan; ``None`` where it was not solved."""
+        H, g, value = tracked = self.quadratic(at, plan, u_last)
         lower, upper = self._lower - plan.ravel(), self._upper - plan.ravel()
         rows = rows_lower = rows_upper = None
         if self.rows:
             rows, rows_lower, rows_upper = self._constraints(at, plan, u_last)
         if self._n_slack:
-            H, tracked = self._slack_hessian.copy(), H
-            H[: self.n, : self.n] = tracked
+            H = self._slack_hessian.copy()
+            H[: self.n, : self.n] = tracked[0]
             g = np.concatenate((g, np.zeros(self._n_slack)))
             lower = np.concatenate((lower, np.zeros(self._n_slack)))
             upper = np.concatenate((upper, np.full(self._n_slack, np.inf)))
@@ -164,12 +174,14 @@ class Condensed:
         if not solution.solved:
             return None
         step = solution.x[: self.n]
-        slope = float(slope_of @ step)
+        slope = float(tracked[1] @ step)
+        cost = value + slope + 0.5 * float(step @ (tracked[0] @ step))
         if self._n_soft:
-            crossed = self._excess(at.y)
-            sides = np.sign(at.y[:, self._n_tracked :] - self._soft_upper)
-            slope += float(np.sum(2 * self._soft_weight * crossed * sides * (at.G[:, self._n_tracked :] @ step)))
-        return step.reshape(plan.shape), slope
+            y, along = at.y, at.G[:, self._n_tracked :] @ step
+            sides = np.sign(y[:, self._n_tracked :] - self._soft_upper)
+            slope += float(np.sum(2 * self._soft_weight * self._excess(y[:, self._n_tracked :]) * sides * along))
+            cost += float(np.sum(self._soft_weight * self._excess(y[:, self._n_tracked :] + along) ** 2))
+        return Direction(step.reshape(plan.shape), slope, cost)
 
     def _constraints(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, Array, Array]:
         blocks, low, high = [], [], []

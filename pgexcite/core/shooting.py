@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.condensed import Condensed, Curvature, Linearised, QPSolver
+from pgexcite.core.condensed import Condensed, Curvature, Direction, Linearised, QPSolver
 from pgexcite.core.controller import Sample
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.model import State
@@ -242,15 +242,12 @@ class Shooting(ABC):
         found = self.condensed.direction(at, ready.plan, u_last)
         if found is None:
             return Solution(Status.QP_FAILED, ready.plan, np.inf, 1, np.inf)
-        return self._taken(Status.ITERATED, at, ready.plan, found[0], u_last, 1)
+        return self._taken(ready.plan, found, 1)
 
-    def _taken(
-        self, status: Status, at: Linearised, plan: Array, step: Array, u_last: Array, iterations: int
-    ) -> Solution:
+    def _taken(self, plan: Array, found: Direction, iterations: int) -> Solution:
         """The plan after a step that is taken on trust; its cost is to first order."""
-        plan = self.condensed.clipped(plan + step)
-        cost = self.condensed.cost(at.after(step), at.references, plan, u_last)
-        return Solution(status, plan, cost, iterations, float(np.abs(step).max()))
+        largest = float(np.abs(found.step).max())
+        return Solution(Status.ITERATED, self.condensed.clipped(plan + found.step), found.cost, iterations, largest)
 
     def _first(self, plans: list[Array], state: State, horizon: Horizon) -> tuple[Array, Rollout | None]:
         """The first of these plans that the model can be stepped through."""
@@ -300,15 +297,17 @@ class Shooting(ABC):
             if found is None:
                 status = Status.QP_FAILED if iteration == 1 else status
                 break
-            direction, slope = found
+            direction = found.step
             step = float(np.abs(direction).max())
             if step <= options.tolerance:
                 status = Status.CONVERGED
                 break
             if step <= near:
-                return self._taken(Status.ITERATED, at, plan, direction, u_last, iteration)
+                return self._taken(plan, found, iteration)
             more = iteration < count
-            better = self._search(state, horizon, plan, direction, u_last, references, (cost, slope), derivatives=more)
+            better = self._search(
+                state, horizon, plan, direction, u_last, references, (cost, found.slope), derivatives=more
+            )
             if better is None:
                 # No decrease can be had along a descent direction: converged to the rounding of the cost.
                 status = Status.CONVERGED if step <= np.sqrt(options.tolerance) else status
@@ -361,4 +360,5 @@ def _finite(state: State, p: Array) -> bool:
 
 
 def _same(a: Array, b: Array) -> bool:
-    return a.shape == b.shape and bool((a == b).all())
+    """Whether two arrays are the same to the bit."""
+    return a.tobytes() == b.tobytes()

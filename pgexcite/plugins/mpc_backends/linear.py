@@ -293,10 +293,8 @@ class _Linear:
         found = self.condensed.direction(at, plan, u_last)
         if found is None:
             return self._failed(Status.QP_FAILED, u_last)
-        step, _ = found
-        self._plan = self.condensed.clipped(plan + step)
-        cost = self.condensed.cost(at.y + at.G @ step.ravel(), at.references, self._plan, u_last)
-        return Solution(Status.CONVERGED, self._plan, cost, 1, float(np.abs(step).max()))
+        self._plan = self.condensed.clipped(plan + found.step)
+        return Solution(Status.CONVERGED, self._plan, found.cost, 1, float(np.abs(found.step).max()))
 
     def _guess(self, u_last: Array) -> Array:
         """The plan that predictions are made around: the last one, a sample on."""
