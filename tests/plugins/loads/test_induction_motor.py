@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from component_harness import Bench
 from pydantic import ValidationError
+from scipy.integrate import solve_ivp
 
-from pgexcite.core.events import Fault, LoadStep
+from pgexcite.core.events import Change, Fault, LoadStep
 from pgexcite.core.initialise import initialise
 from pgexcite.core.linearise import linearise
 from pgexcite.core.network import Bus, Line
@@ -80,6 +83,44 @@ def test_it_is_stable_beyond_its_pull_out_it_stalls():
     p, speed = after_fault(1.5)
     assert speed < 0.6  # stalled, and drawing a short circuit's current
     assert np.isfinite(p).all()
+
+
+def test_a_dip_against_the_flux_linkages_of_stator_and_rotor():
+    """The voltage equations of stator and rotor without the stator's transients, integrated by another solver."""
+    depth, back, t_end, h = 0.6, 0.4, 3.0, 0.002
+    system = plant()
+    system = replace(system, lines={}, buses={"B": Bus()}, devices=tuple(replace(d, bus="B") for d in system.devices))
+    dip = [Change(t, {"infinite_bus.grid.v": v}, "dip") for t, v in ((0.1, depth), (0.1 + back, 1.0))]
+    sim = Simulation(system, Settings(t_end, h), dip)
+    begin = dict(zip(sim.model.x_names, sim.state.x, strict=True))
+    t_0 = dict(zip(sim.model.p_names, sim.p, strict=True))[f"{SLOT}.t_0"]
+    assert sim.run().ending.value == "completed"
+    m, omega_0 = MOTOR, 2 * np.pi * 50
+    X_ss, X_rr = m.X_s + m.X_m, m.X_r + m.X_m
+
+    def currents(psi_r, v):
+        """Of stator and rotor, from the stator's voltage and psi_r = X_rr i_r + X_m i_s."""
+        i_s = (v - 1j * m.X_m / X_rr * psi_r) / (m.R_s + 1j * (X_ss - m.X_m**2 / X_rr))
+        return i_s, (psi_r - m.X_m * i_s) / X_rr
+
+    def slope(t, x, v):
+        psi_r, omega = complex(x[0], x[1]), x[2]
+        i_s, i_r = currents(psi_r, v)
+        moving = -omega_0 * (m.R_r * i_r + 1j * (1 - omega) * psi_r)
+        t_e = (np.conj(X_ss * i_s + m.X_m * i_r) * i_s).imag
+        return [moving.real, moving.imag, (t_e - t_0 * omega**m.m) / (2 * m.H)]
+
+    e = complex(begin[f"{SLOT}.e_re"], begin[f"{SLOT}.e_im"])
+    psi_r = e * X_rr / (1j * m.X_m)
+    x, trace = [psi_r.real, psi_r.imag, begin[f"{SLOT}.omega_m"]], sim.trace()
+    for start, stop, v in ((0.0, 0.1, 1.0), (0.1, 0.1 + back, depth), (0.1 + back, t_end, 1.0)):
+        inside = (trace.t > start + h / 2) & (trace.t < stop - h / 2)
+        found = solve_ivp(slope, (start, stop), x, args=(v,), rtol=1e-10, atol=1e-12, t_eval=[*trace.t[inside], stop])
+        x = found.y[:, -1]
+        assert np.abs(found.y[2, :-1] - trace[f"{SLOT}.omega_m"][inside]).max() < 1e-5  # measured 1.5e-6
+        p = [(v * np.conj(currents(complex(a, b), v)[0])).real * 0.6 for a, b, _ in found.y[:, :-1].T]
+        assert np.abs(p - trace[f"{SLOT}.p"][inside]).max() < 1e-4  # measured 2.8e-5
+    assert trace[f"{SLOT}.omega_m"].min() < 0.95  # the dip is deep enough to matter
 
 
 def test_load_steps_move_torque_and_capacitor():
