@@ -46,6 +46,15 @@ LINEAR = (f'{MPC}.backend="linear"', f"{MPC}.options={{}}", 'simulation.compile=
 EQUIVALENT = (f'{MPC}.backend="equivalent"', f"{MPC}.options={{}}")
 LONG = (f"{MPC}.N_p=12", f"{MPC}.growth=1.4")
 
+HORIZONS = {
+    "dt 0.1 s, N_p 10": (f"{MPC}.dt=0.1", f"{MPC}.N_p=10"),
+    "dt 0.1 s growing by 1.4, N_p 15 to 39 s": (f"{MPC}.dt=0.1", f"{MPC}.N_p=15", f"{MPC}.growth=1.4"),
+    "dt 0.2 s, N_p 10": (f"{MPC}.dt=0.2", f"{MPC}.N_p=10"),
+    "dt 0.2 s growing by 1.4, N_p 12 to 28 s": (f"{MPC}.dt=0.2", f"{MPC}.N_p=12", f"{MPC}.growth=1.4"),
+    "dt 0.5 s, N_p 10": (f"{MPC}.dt=0.5", f"{MPC}.N_p=10"),
+    "dt 1 s, N_p 5": (f"{MPC}.dt=1.0", f"{MPC}.N_p=5"),
+}
+
 Row = dict[str, Any]
 
 
@@ -54,7 +63,8 @@ def run(name: str, overrides: Sequence[str] = (), mismatch: Mapping[str, float] 
     path = CONFIGS / f"{name}.toml"
     data = override(read(path), overrides)
     if mismatch is not None:
-        data["controller"]["mpc"]["options"]["mismatch"] = dict(mismatch)
+        mpc = data["controller"]["mpc"]
+        mpc["options"]["mismatch" if mpc["backend"] == "nmpc" else "model"] = dict(mismatch)
     scenario = from_data(data, path)
     simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
     outcome: Outcome = simulation.run()
@@ -83,15 +93,23 @@ BACKENDS = {
     "linear, primary of the tap changer's voltage": ("link_loss_nmpc_primary_oltc", LINEAR),
     "linear, secondary": ("link_loss_nmpc_secondary", LINEAR),
     "linear, limit": ("link_loss_nmpc_secondary_limit", LINEAR),
-    "equivalent, primary, dt 0.1 s, N_p 10": (
-        "link_loss_nmpc_primary",
-        (*EQUIVALENT, f"{MPC}.dt=0.1", f"{MPC}.N_p=10"),
-    ),
-    "equivalent, primary, dt 0.2 s, N_p 10": (
-        "link_loss_nmpc_primary",
-        (*EQUIVALENT, f"{MPC}.dt=0.2", f"{MPC}.N_p=10"),
-    ),
-    "equivalent, primary, dt 1 s, N_p 5": ("link_loss_nmpc_primary", EQUIVALENT),
+    **{
+        f"equivalent, primary, {said}": ("link_loss_nmpc_primary", (*EQUIVALENT, *horizon))
+        for said, horizon in HORIZONS.items()
+    },
+    "linear, figure 14, disturbance known": ("link_loss_nmpc_secondary_fig14", LINEAR),
+    "linear, figure 14, unknown": ("link_loss_nmpc_secondary_fig14", (*LINEAR, UNKNOWN)),
+    "linear, figure 15, disturbance known": ("link_loss_nmpc_secondary_fig15", LINEAR),
+    "linear, figure 15, unknown": ("link_loss_nmpc_secondary_fig15", (*LINEAR, UNKNOWN)),
+    **{
+        f"{said}, primary, event of figure {n}": (f"link_loss_nmpc_primary_fig{n}", overrides)
+        for n in (14, 15)
+        for said, overrides in {
+            "nmpc": (),
+            "linear": LINEAR,
+            **{f"equivalent, {said}": (*EQUIVALENT, *horizon) for said, horizon in HORIZONS.items()},
+        }.items()
+    },
 }
 FIGURES: dict[str, tuple[str, dict[str, tuple[str, tuple[str, ...]]], tuple[Any, ...]]] = {
     "figure_12": (
@@ -195,6 +213,14 @@ MISMATCHED = {
     "limit": ("link_loss_nmpc_secondary_limit", ()),
     "limit, horizon of 278 s, one move": ("link_loss_nmpc_secondary_limit", LONG),
     "limit, horizon of 278 s, three moves": ("link_loss_nmpc_secondary_limit", (*LONG, MOVES)),
+    "figure 14": ("link_loss_nmpc_secondary_fig14", ()),
+    "figure 14, 0.94 pu to be held": ("link_loss_nmpc_secondary_fig14", (f"{MPC}.V_ref=0.94",)),
+    "limit, link back": ("link_loss_nmpc_secondary_limit_back", ()),
+    "linear, primary": ("link_loss_nmpc_primary", LINEAR),
+    "linear, secondary": ("link_loss_nmpc_secondary", LINEAR),
+    "linear, limit": ("link_loss_nmpc_secondary_limit", LINEAR),
+    "linear, figure 14, disturbance known": ("link_loss_nmpc_secondary_fig14", LINEAR),
+    "linear, limit, link back": ("link_loss_nmpc_secondary_limit_back", LINEAR),
 }
 
 

@@ -161,6 +161,41 @@ def test_the_field_voltage_of_one_unit_saves_only_beyond_its_limiters_current():
     assert claim("link_loss_nmpc_primary", bound)[0].ending.value == "voltage_collapse"
 
 
+MPC = "controller.mpc"
+LINEAR = (f'{MPC}.backend="linear"', f"{MPC}.options={{}}", 'simulation.compile="never"')
+EQUIVALENT = (f'{MPC}.backend="equivalent"', f"{MPC}.options={{}}")
+
+
+@pytest.mark.slow
+def test_a_wrong_reactance_loses_the_perfect_state_and_not_the_measurements():
+    """At 755 MW with South at half its reactance in the model."""
+    name = "link_loss_nmpc_secondary_limit"
+    wrong = '"line.South.X"=0.05'
+    perfect = claim(name, f"{MPC}.options={{mode='converged', step=0.1, mismatch={{{wrong}}}}}")[0]
+    assert perfect.ending.value == "voltage_collapse"
+    measured = (LINEAR[0], LINEAR[2], f"{MPC}.options={{model={{{wrong}}}}}")
+    outcome, figures = claim(name, *measured)
+    assert outcome.ending.value == "completed"
+    assert figures["primary_end"] == pytest.approx(0.843, abs=0.002)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "last"), [(14, 0.949), (15, 0.863)])
+@pytest.mark.parametrize("known", ["true", "false"])
+def test_measurements_do_in_figures_14_and_15_what_the_perfect_model_does(n, last, known):
+    outcome, figures = claim(f"link_loss_nmpc_secondary_fig{n}", *LINEAR, f"{MPC}.disturbance_known={known}")
+    assert outcome.ending.value == "completed"
+    assert figures["primary_end"] == pytest.approx(last, abs=0.002)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("dt", "N_p", "least"), [(0.2, 10, 0.71), (1.0, 5, 0.70)])
+def test_one_unit_that_sees_its_terminals_only_holds_the_grid(dt, N_p, least):
+    outcome, figures = claim("link_loss_nmpc_primary", *EQUIVALENT, f"{MPC}.dt={dt}", f"{MPC}.N_p={N_p}")
+    assert outcome.ending.value == "completed"
+    assert figures["primary_min"] > least  # measured 0.718 and 0.703
+
+
 def test_candidates_find_plans_that_descent_from_the_last_plan_does_not(tmp_path):
     """A horizon of 278 s with taps and limiters in it, 30 s after the link was lost."""
     long = ("controller.mpc.N_p=12", "controller.mpc.growth=1.4")
