@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pgexcite.core import registry
+from pgexcite.core.polish import polished
 from pgexcite.core.qp import WIDE, QPSolution, usable
 
 Array = NDArray[np.float64]
@@ -86,9 +87,10 @@ class NamedSolver:
         G, h = _one_sided(rows, rows_lower, rows_upper)
         if not (lower <= upper).all():
             return nothing
+        lb, ub = lower, upper
         if self._name == "proxqp":  # to it a bound that does not exist is a large number, not an infinity
-            lower, upper = np.maximum(lower, -WIDE), np.minimum(upper, WIDE)
-        problem = qpsolvers.Problem((H + H.T) / 2, g, G, h, None, None, lower, upper)
+            lb, ub = np.maximum(lower, -WIDE), np.minimum(upper, WIDE)
+        problem = qpsolvers.Problem((H + H.T) / 2, g, G, h, None, None, lb, ub)
         if self._sparse:
             problem = _sparse(problem)
         try:
@@ -97,7 +99,11 @@ class NamedSolver:
             return nothing
         if not solution.found or solution.x is None or not np.isfinite(solution.x).all():
             return nothing
-        return QPSolution(np.clip(solution.x, lower, upper), np.zeros(0), True, 0)
+        x = solution.x
+        if solution.z is not None and solution.z_box is not None:
+            multipliers = np.concatenate((solution.z, solution.z_box))
+            x, _ = polished(H, g, lower, upper, G, *_sides(h), x, multipliers)
+        return QPSolution(np.clip(x, lower, upper), np.zeros(0), True, 0)
 
 
 def _folded(
@@ -126,6 +132,11 @@ def _one_sided(rows: Array | None, lower: Array | None, upper: Array | None) -> 
     above, below = np.isfinite(upper), np.isfinite(lower)
     G = np.vstack((rows[above], -rows[below]))
     return (G, np.concatenate((upper[above], -lower[below]))) if G.size else (None, None)
+
+
+def _sides(h: Array | None) -> tuple[Array | None, Array | None]:
+    """Bounds of one-sided rows."""
+    return (None, None) if h is None else (np.full(h.size, -np.inf), h)
 
 
 def _sparse(problem: qpsolvers.Problem) -> qpsolvers.Problem:
