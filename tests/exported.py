@@ -5,9 +5,18 @@ from __future__ import annotations
 import ctypes
 import re
 import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from pgexcite.core import codegen
+from pgexcite.core.config import Scenario
+from pgexcite.core.controller import Sample
+from pgexcite.core.export.recorder import Recorder
+from pgexcite.core.simulate import Simulation
 
 STRICT = ["-std=c99", "-O1", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-Wpedantic"]
 
@@ -93,3 +102,85 @@ def _structure(fields: list[tuple[str, str, str]]) -> type[ctypes.Structure]:
     kinds = {"double": ctypes.c_double, "int": ctypes.c_int}
     layout = tuple((name, kinds[kind] * int(size) if size else kinds[kind]) for kind, name, size in fields)
     return type("Fields", (ctypes.Structure,), {"_fields_": layout})
+
+
+GARBAGE = [np.nan, np.inf, -np.inf, 1e300, -1e300, 1e12, 999.0, -999.0, 0.0, 1e-300]
+
+
+def record_trouble(case: Scenario, directory: Path, signals: Sequence[str], n: int, seed: int = 4) -> list[int]:
+    """Replace the recording by one of ``n`` samples in trouble with these signals; the levels of the ladder.
+
+    Samples of the scenario's own run come over and over: lost, hanging or absurd for a while, in charge or not.
+    """
+    session = session_of(case)
+    recorder, levels = Recorder(session, session.solver.parts("", case.controllers["mpc"].measures())), []
+    for sample in _troubled(_samples(case), np.random.default_rng(seed), signals, n):
+        session.act(sample)
+        session.prepare()
+        levels.append(session.level)
+    (directory / "replay.txt").write_text("".join(f"{line}\n" for line in recorder.lines))
+    return levels
+
+
+def session_of(case: Scenario) -> Any:
+    """The controller of a scenario, at the start of a run."""
+    return Simulation(case.system, case.settings, case.changes, case.controllers).sessions["mpc"]
+
+
+def _samples(case: Scenario) -> list[Sample]:
+    """What the controller is handed in a run."""
+    simulation = Simulation(case.system, case.settings, case.changes, case.controllers)
+    session, samples = simulation.sessions["mpc"], []
+    act = session.act
+
+    def recorded(sample: Sample) -> Any:
+        samples.append(sample)
+        return act(sample)
+
+    session.act = recorded
+    simulation.run()
+    return samples
+
+
+def _troubled(samples: list[Sample], rng: np.random.Generator, signals: Sequence[str], n: int) -> Iterator[Sample]:
+    before, left, trouble, active = samples[0].measured, 0, "", True
+    for k in range(n):
+        sample = samples[k % len(samples)]
+        measured = dict(sample.measured)
+        if left == 0:
+            trouble = str(rng.choice(["", "", "lost", "hangs", "wild", "absurd"]))
+            left = int(rng.integers(1, 12))
+        left -= 1
+        if rng.random() < 0.03:
+            active = not active
+        if trouble == "hangs":
+            measured = before
+        elif trouble == "lost":
+            measured = dict.fromkeys(measured, np.nan)
+        elif trouble:
+            for signal in signals:
+                measured[signal] += (1.0 if trouble == "wild" else 1e3) * rng.normal()
+        before = measured
+        yield replace(sample, t=0.05 * k, measured=measured, active=active)
+
+
+def replay_garbage(directory: Path, width: int, times: int = 10) -> str:
+    """What is printed of a replay with garbage among its first ``width`` numbers, under the sanitizers of the compiler.
+
+    Empty where the compiler has none of addresses and undefined behaviour.
+    """
+    sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
+    sources = ["mpc.c", "mpc_replay.c", "-o", "checked", "-lm"]
+    command = [compiler(), "-std=c99", "-O1", "-g", *sanitizers, *sources]
+    if subprocess.run(command, cwd=directory, capture_output=True, check=False).returncode:
+        return ""
+    rng, lines = np.random.default_rng(5), []
+    for line in (directory / "replay.txt").read_text().splitlines() * times:
+        words = line.split()
+        for k in range(width):
+            if k != 1 and rng.random() < 0.1:
+                words[k] = str(rng.choice(GARBAGE))
+        lines.append(" ".join(words))
+    (directory / "garbage.txt").write_text("\n".join(lines) + "\n")
+    done = subprocess.run(["./checked", "garbage.txt"], cwd=directory, capture_output=True, text=True, check=False)
+    return done.stderr + done.stdout

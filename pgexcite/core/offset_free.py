@@ -18,7 +18,7 @@ from pgexcite.core.prediction import Transition
 Array = NDArray[np.float64]
 
 
-_LARGEST = 2.0
+LARGEST = 2.0
 """Disturbance beyond which the filter has diverged, pu: the arc fault at the transformer of the scenarios makes one of 0.95."""
 
 
@@ -73,15 +73,21 @@ class OffsetFreeFilter:
         noise: what is assumed.
         rows: positions among the outputs of what is measured, shape ``(n_m,)``.
         x: states at first, shape ``(n_x,)``.
+
+    Attributes:
+        at: what it believes.
+        surprise: largest innovation of the last measurement.
+        start: what it believes at first.
+        walk: variances of what comes in during a sample, of states and disturbances.
     """
 
     def __init__(self, disturbances: Disturbances, noise: Noise, rows: NDArray[np.intp], x: Array) -> None:
-        self.disturbances, self.noise, self._rows = disturbances, noise, rows
+        self.disturbances, self.noise, self.rows = disturbances, noise, rows
         self._n, self._n_d, self._n_t = x.size, disturbances.outputs.shape[1], disturbances.pushing.shape[1]
         drift = np.concatenate((np.full(self._n_d, noise.drift), np.full(self._n_t, noise.drift_torque)))
-        self._walk = np.diag(np.concatenate((noise.state, drift)) ** 2)
-        self._start = Gaussian(np.concatenate((x, np.zeros(drift.size))), 100.0 * self._walk)
-        self.at, self.surprise = self._start, 0.0
+        self.walk = np.concatenate((noise.state, drift)) ** 2
+        self.start = Gaussian(np.concatenate((x, np.zeros(drift.size))), np.diag(100.0 * self.walk))
+        self.at, self.surprise = self.start, 0.0
 
     @property
     def x(self) -> Array:
@@ -103,7 +109,7 @@ class OffsetFreeFilter:
     def sound(self) -> bool:
         """Whether the estimate is finite, and no disturbance is larger than any that an undamaged plant could explain."""
         finite = bool(np.isfinite(self.at.x).all() and np.isfinite(self.at.P).all())
-        return finite and bool(np.abs(self.at.x[self._n :]).max(initial=0.0) <= _LARGEST)
+        return finite and bool(np.abs(self.at.x[self._n :]).max(initial=0.0) <= LARGEST)
 
     def disturbed(self, y: Array) -> Array:
         """Outputs of the model with the disturbances on them, shape ``(..., n_y)``."""
@@ -113,7 +119,7 @@ class OffsetFreeFilter:
     def predict(self, step: Transition) -> None:
         """A sample has passed: the states went from the present estimate to ``step.x``."""
         n, noise, pushing = self._n, self.noise, self.disturbances.pushing
-        A, into = np.eye(self.at.x.size), self._walk.copy()
+        A, into = np.eye(self.at.x.size), np.diag(self.walk)
         A[:n, :n], A[:n, n + self._n_d :] = step.A, pushing
         random = np.hstack((step.B * noise.command, self.disturbances.torques * noise.torque))
         into[:n, :n] += random @ random.T
@@ -127,8 +133,8 @@ class OffsetFreeFilter:
             y: outputs the model predicts without disturbances, shape ``(n_y,)``.
             C: their derivatives to the states, shape ``(n_y, n_x)``.
         """
-        innovation = measured - self.disturbed(y)[self._rows]
-        seen = np.hstack((C, self.disturbances.outputs, np.zeros((C.shape[0], self._n_t))))[self._rows]
+        innovation = measured - self.disturbed(y)[self.rows]
+        seen = np.hstack((C, self.disturbances.outputs, np.zeros((C.shape[0], self._n_t))))[self.rows]
         self.at = self.at.corrected(innovation, seen, self.noise.measured**2)
         there = innovation[np.isfinite(innovation)]
         self.surprise = float(np.abs(there).max()) if there.size else np.nan
@@ -136,10 +142,10 @@ class OffsetFreeFilter:
     def confused(self, step: Transition) -> Sequence[str]:
         """Names of the disturbances that the measurements cannot tell apart at rest, with this transition of a sample."""
         moving = self.noise.state > 0
-        pushing, outputs = self.disturbances.pushing[moving], self.disturbances.outputs[self._rows]
+        pushing, outputs = self.disturbances.pushing[moving], self.disturbances.outputs[self.rows]
         B_d = np.hstack((np.zeros((pushing.shape[0], self._n_d)), pushing))
         C_d = np.hstack((outputs, np.zeros((outputs.shape[0], self._n_t))))
-        found = unidentified(step.A[np.ix_(moving, moving)], B_d, step.C[np.ix_(self._rows, moving)], C_d)
+        found = unidentified(step.A[np.ix_(moving, moving)], B_d, step.C[np.ix_(self.rows, moving)], C_d)
         return [self.disturbances.names[k] for k in found]
 
     def memory(self) -> Mapping[str, Array]:
@@ -148,5 +154,5 @@ class OffsetFreeFilter:
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off; from the start where it is empty."""
-        self.at = Gaussian(memory["x"], memory["P"]) if memory else self._start
+        self.at = Gaussian(memory["x"], memory["P"]) if memory else self.start
         self.surprise = float(memory["surprise"]) if memory else 0.0

@@ -18,17 +18,6 @@ static void shift(const double *from, double *to) {
         for (i = 0; i < N_COMMANDS; i++) to[k * N_COMMANDS + i] = from[SHIFTED[k] * N_COMMANDS + i];
 }
 
-/* The nearest plan that keeps the bounds on moves from u_last on, and those on commands. */
-static void reach(const double *from, const double *u_last, double *to) {
-    int i;
-    for (i = 0; i < N_V; i++) {
-        double before = i < N_COMMANDS ? u_last[i] : to[i - N_COMMANDS], move = from[i];
-        if (move < before - DU_MAX[i]) move = before - DU_MAX[i];
-        if (move > before + DU_MAX[i]) move = before + DU_MAX[i];
-        to[i] = clipped(move, i);
-    }
-}
-
 /* What is tracked at the end of each sample of a horizon that begins at t, as far as it is known now: the latest change holds. */
 static void references(double t, double now, double *to) {
     int j, i, k;

@@ -100,6 +100,17 @@ static int advance(Point *at, double t, double *p, const double *commands) {
     return !(differ(p, row_p, N_P) || differ(wanted, at->u, N_U)) || settle_at(at, wanted, p);
 }
 
+/* The nearest plan that keeps the bounds on moves from u_last on, and those on commands. */
+static void reach(const double *from, const double *u_last, double *to) {
+    int i;
+    for (i = 0; i < N_V; i++) {
+        double before = i < N_COMMANDS ? u_last[i] : to[i - N_COMMANDS], move = from[i];
+        if (move < before - DU_MAX[i]) move = before - DU_MAX[i];
+        if (move > before + DU_MAX[i]) move = before + DU_MAX[i];
+        to[i] = clipped(move, i);
+    }
+}
+
 static double largest(const double *a, int n) {
     double found = 0;
     int i;

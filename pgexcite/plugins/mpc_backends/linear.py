@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -15,10 +16,15 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from pgexcite.core import qp_by_name
+from pgexcite.core.codegen import loop
 from pgexcite.core.condensed import Condensed, Linearised
 from pgexcite.core.controller import Plant, Sample, Surroundings, as_arrays
 from pgexcite.core.declare import par
 from pgexcite.core.errors import ConfigError, Problem
+from pgexcite.core.export import Input, Parts
+from pgexcite.core.export.linear import filtering, predictions
+from pgexcite.core.export.shared import objections
+from pgexcite.core.export.shooting import DELAYED
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.local import LocalModel
 from pgexcite.core.mpc import Problem as ControlProblem
@@ -34,6 +40,13 @@ _SIGNALS = ("v_t", "omega", "p_e", "q_e", "i_fd")
 """What the filter takes from a unit's terminals; the field voltage is an input of the model."""
 _ABSURD = 1e3
 """A measurement beyond this, pu, says that an instrument is broken: it is neither believed nor taken for a lost one."""
+
+
+_AGREEMENT = 1e-9
+"""Difference from Python of a command of its C, pu."""
+_ABOUT = """One predictive controller for one plant: a linear model of its own, a Kalman filter on states and disturbances that sees
+   the unit's measurements, and one quadratic program a sample, as the backend "linear" of pgexcite has them; and the checks of
+   pgexcite.core.ladder."""
 
 
 class Linear(BaseModel):
@@ -113,12 +126,13 @@ class _Linear:
     def __init__(self, options: Linear, problem: ControlProblem, surroundings: Surroundings) -> None:
         self.options, self.problem = options, problem
         initial, kernel = own_model(surroundings, options.model, "options.model")
+        self._initial, self._kernel, self._rule = initial, kernel, surroundings.rule
         model = initial.model
         self.condensed = Condensed(problem, qp_by_name.NamedSolver(options.solver))
         units = [path.rpartition(".")[0] for path in problem.speeds]
         at_terminals = [f"{unit}.{signal}" for unit in units for signal in _SIGNALS]
         self._measured = list(dict.fromkeys([*at_terminals, *problem.voltages]))
-        outputs = list(dict.fromkeys([*self._measured, *self.condensed.outputs()]))
+        self._outputs = outputs = list(dict.fromkeys([*self._measured, *self.condensed.outputs()]))
         self._predicted = [outputs.index(path) for path in self.condensed.outputs()]
         self._commands = [model.position("u", path) for path in problem.commands]
         self._horizons = Horizons(model, problem, surroundings.h, surroundings.h)
@@ -231,6 +245,53 @@ class _Linear:
         self._u = memory.get("u", self._point_0.u[self._commands] + self._u_bias)
         self._age = int(memory.get("age", 0))
 
+    def parts(self, where: str, measured: Sequence[str]) -> Parts:
+        """Its C; see ``pgexcite.core.export``.
+
+        Raises:
+            ConfigError: something in the configuration cannot be exported.
+        """
+        problems = objections(where, self.condensed)
+        if self._kernel.functions.newton is None:
+            problems.append(Problem(f"{where}.backend", "the model is too large to be written out as C"))
+        if problems:
+            raise ConfigError(problems)
+        functions, constants, arrays = predictions(
+            self._kernel, self._initial, self._horizons, self._outputs, self._rule
+        )
+        of_filter, numbers = filtering(self.filter)
+        every = {"once": 0, "scheduled": self.options.every, "every": 1}[self.options.relinearise]
+        point = self._point_0
+        own: dict[str, NDArray[np.float64] | NDArray[np.int32]] = {
+            "SEEN_AT": np.array([list(measured).index(path) for path in self._measured], dtype=np.int32),
+            "PREDICTED": np.array(self._predicted, dtype=np.int32),
+            **{f"POINT_{name.upper()}": getattr(point, name) for name in ("x", "z", "d")},
+            "POINT_U": point.u[self._commands],
+            "U_BIAS": self._u_bias,
+            "Y_BIAS": self._y_bias,
+            "Y_0": self._y_0,
+            "TO_Y_0": self._C_0.T,
+        }
+        core = ("horizon.c", "local.c", "kalman.c", "offset_free.c")
+        return Parts(
+            about=_ABOUT + DELAYED * self.problem.delayed,
+            inputs=(
+                Input("t", "s, on the clock of the references"),
+                Input("active", "whether the controller is in charge", kind="int"),
+                Input.of("measured", "what is measured, NaN where it was lost", measured),
+                Input("u_last", "commands in force until the plan begins", len(self._commands)),
+            ),
+            record=_recorded,
+            condensed=self.condensed,
+            functions=functions,
+            loops=("step.c", "rollout.c"),
+            constants=constants | of_filter | {"relinearise_every": every, "dt": self.problem.dt},
+            arrays=arrays | numbers | own,
+            templates=(*(loop(file) for file in core), (Path(__file__).parent / "linear.c").read_text()),
+            tolerance=_AGREEMENT,
+            told=[name for name in self._diagnostics() if name != "age"],
+        )
+
     # Where the model is.
 
     def _observe(self, sample: Sample, u_last: Array) -> bool:
@@ -320,3 +381,8 @@ class _Linear:
         for path, value in self.filter.estimates.items():
             believed[f"disturbance.{path if several else path.rpartition('.')[2]}"] = value
         return believed | {"innovation": self.filter.surprise, "age": float(self._age)}
+
+
+def _recorded(sample: Sample, u_last: Array) -> Sequence[Array | float]:
+    """The inputs of its C."""
+    return [sample.t, int(sample.active), np.array(list(sample.measured.values())), u_last]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import exported
@@ -13,8 +11,6 @@ import pytest
 from pgexcite.core.config import load
 from pgexcite.core.errors import ConfigError
 from pgexcite.core.export import export_c
-from pgexcite.core.export.recorder import Recorder
-from pgexcite.core.simulate import Simulation
 
 SMIB = Path(__file__).parents[3] / "configs" / "smib"
 FAULT, LINE_TRIP = SMIB / "fault_equivalent.toml", SMIB / "line_trip_equivalent.toml"
@@ -72,62 +68,13 @@ def test_its_commands_and_estimates_are_those_of_python(case, tmp_path):
     assert figures["samples with another number of iterations"] == 0
 
 
-def session_of(case):
-    return Simulation(case.system, case.settings, case.changes, case.controllers).sessions["mpc"]
-
-
-def samples_of(case):
-    """What the controller is handed in a run."""
-    simulation = Simulation(case.system, case.settings, case.changes, case.controllers)
-    session, samples = simulation.sessions["mpc"], []
-    act = session.act
-
-    def recorded(sample):
-        samples.append(sample)
-        return act(sample)
-
-    session.act = recorded
-    simulation.run()
-    return samples
-
-
-def troubled(samples, rng, n):
-    """The samples over and over: lost, hanging or absurd for a while, in charge or not."""
-    before, left, trouble, active = samples[0].measured, 0, "", True
-    for k in range(n):
-        sample = samples[k % len(samples)]
-        measured = dict(sample.measured)
-        if left == 0:
-            trouble = str(rng.choice(["", "", "lost", "hangs", "wild", "absurd"]))
-            left = int(rng.integers(1, 12))
-        left -= 1
-        if rng.random() < 0.03:
-            active = not active
-        if trouble == "hangs":
-            measured = before
-        elif trouble == "lost":
-            measured = dict.fromkeys(measured, np.nan)
-        elif trouble:
-            scale = 1.0 if trouble == "wild" else 1e3
-            measured["unit.G2.v_t"] += scale * rng.normal()
-            measured["unit.G2.p_e"] += scale * rng.normal()
-        before = measured
-        yield replace(sample, t=0.05 * k, measured=measured, active=active)
-
-
 @pytest.mark.parametrize("delayed", [False, True])
 def test_in_whatever_trouble_it_does_what_python_does(delayed, tmp_path):
     """Through losses, hanging transmitters, wild samples, restarts and changes of who is in charge."""
     case = scenario(FAULT, f"controller.mpc.delayed={str(delayed).lower()}")
     export_c(case, tmp_path)
-    session = session_of(case)
-    recorder, levels = Recorder(session, session.solver.parts("", ())), []
-    for sample in troubled(samples_of(case), np.random.default_rng(4), 600):
-        session.act(sample)
-        session.prepare()
-        levels.append(session.level)
+    levels = exported.record_trouble(case, tmp_path, ["unit.G2.v_t", "unit.G2.p_e"], 600)
     assert min(levels.count(level) for level in (0, 1, 2)) > 20
-    (tmp_path / "replay.txt").write_text("".join(f"{line}\n" for line in recorder.lines))
     code, figures = exported.replay(tmp_path)
     assert code == 0
     assert figures["samples"] == 600
@@ -144,9 +91,6 @@ def test_it_stands_alone_and_allocates_nothing(tmp_path):
     assert wanted == set()
 
 
-GARBAGE = [np.nan, np.inf, -np.inf, 1e300, -1e300, 1e12, 999.0, -999.0, 0.0, 1e-300]
-
-
 def test_whatever_it_is_told_its_command_is_finite_and_within_its_bounds(tmp_path):
     export_c(scenario(), tmp_path)
     controller, rng = exported.Library(tmp_path), np.random.default_rng(3)
@@ -155,9 +99,9 @@ def test_whatever_it_is_told_its_command_is_finite_and_within_its_bounds(tmp_pat
         controller.load(k % len(controller.lines))
         for _ in range(int(rng.integers(4)) if k % 100 > 50 else 0):
             if rng.random() < 0.8:
-                controller.input.measured[int(rng.integers(5))] = float(rng.choice(GARBAGE))
+                controller.input.measured[int(rng.integers(5))] = float(rng.choice(exported.GARBAGE))
             else:
-                controller.input.u_last[0], controller.input.t = rng.choice(GARBAGE, 2)
+                controller.input.u_last[0], controller.input.t = rng.choice(exported.GARBAGE, 2)
         out = controller.step()
         assert -3.2 <= out.command[0] <= 3.2
         # The estimate stays one: x_s and v_bus within their bounds, with deviations.
@@ -171,39 +115,17 @@ def test_whatever_it_is_told_its_command_is_finite_and_within_its_bounds(tmp_pat
 def test_garbage_breaks_no_rule_of_the_language(tmp_path):
     """The same under the sanitizers of addresses and of undefined behaviour."""
     export_c(scenario(), tmp_path)
-    sanitizers = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all"]
-    command = [
-        exported.compiler(),
-        "-std=c99",
-        "-O1",
-        "-g",
-        *sanitizers,
-        "mpc.c",
-        "mpc_replay.c",
-        "-o",
-        "checked",
-        "-lm",
-    ]
-    if subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode:
+    printed = exported.replay_garbage(tmp_path, width=8)
+    if not printed:
         pytest.skip("the compiler has no sanitizers")
-    rng, lines = np.random.default_rng(5), []
-    for line in (tmp_path / "replay.txt").read_text().splitlines() * 10:
-        words = line.split()
-        for k in range(8):
-            if k != 1 and rng.random() < 0.1:
-                words[k] = str(rng.choice(GARBAGE))
-        lines.append(" ".join(words))
-    (tmp_path / "garbage.txt").write_text("\n".join(lines) + "\n")
-    done = subprocess.run(["./checked", "garbage.txt"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.stderr == ""
-    assert "samples 800" in done.stdout
+    assert printed.startswith("samples 800")
 
 
 def test_what_cannot_be_exported_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="must be positive"):
         export_c(scenario(FAULT, "controller.mpc.R=0.0"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    solver = session_of(scenario()).solver
+    solver = exported.session_of(scenario()).solver
     solver._observer = object()
     with pytest.raises(ConfigError, match="this estimator offers no C"):
         solver.parts("controller.mpc", ())
