@@ -366,7 +366,8 @@ class _Call:
         """Put a prediction's arguments in place."""
         for array, values in zip(self._point, (state.x, state.z, state.d), strict=True):
             array[:] = values
-        self._moves[:] = moves.ravel()
+        # A transition has a single move, whatever a plan has.
+        self._moves[: moves.size] = moves.ravel()
         pieces = (horizon.counts, horizon.lengths, horizon.moves, horizon.rows, horizon.ends)
         if len(self._kept) != len(pieces) or any(a is not b for a, b in zip(self._kept, pieces, strict=True)):
             self._kept, self.pieces = pieces, [_address(a) for a in pieces]
