@@ -16,6 +16,7 @@ FIGURES = (
     "recovery_1",
     "v_t_iae",
     "damping",
+    "t_crit",
     "control_energy",
     "cost",
     "fallbacks",

@@ -18,6 +18,10 @@ A study file names scenarios and what is varied:
     set = ["line.L1.X=0.3"]
     only = { nmpc = ["controller.mpc.options.mismatch={...}"] }   # further overrides of single variants
 
+    [clearing]                                # where wanted: the critical clearing time of every case, too
+    tolerance = 0.0025
+    set = ["simulation.t_end=5"]
+
 Every case is keyed by the hash of its resolved configuration: a study resumes where it stopped, and a case that stands in two
 studies is the same case. A worker that dies costs its case, not the study.
 """
@@ -40,6 +44,7 @@ from pgexcite.core.config import load, read
 from pgexcite.core.errors import ConfigError, PgexciteError, Problem
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.summary import summarise
+from pgexcite.studies.cct import critical_clearing_time
 from pgexcite.studies.measures import swing_figures
 
 NOMINAL = "nominal"
@@ -65,6 +70,13 @@ class Factor(_Table):
     only: Mapping[str, tuple[str, ...]] = Field(default_factory=dict, description="further overrides by variant")
 
 
+class Clearing(_Table):
+    """How critical clearing times are found."""
+
+    tolerance: float = Field(1e-3, gt=0, description="width of the final bracket, s")
+    overrides: tuple[str, ...] = Field((), alias="set", description="overrides of the runs of the search")
+
+
 class StudyFile(_Table):
     """A study as written in a file."""
 
@@ -73,6 +85,7 @@ class StudyFile(_Table):
     common: tuple[str, ...] = Field((), description="overrides of every case")
     variant: Mapping[str, Variant]
     factor: tuple[Factor, ...] = ()
+    clearing: Clearing | None = Field(None, description="search for critical clearing times, where wanted")
 
 
 @dataclass(frozen=True)
@@ -85,6 +98,7 @@ class Case:
     overrides: tuple[str, ...]
     unit: str
     key: str
+    clearing: Clearing | None = None
 
 
 @dataclass(frozen=True)
@@ -133,9 +147,10 @@ def cases(path: Path) -> tuple[str, list[Case]]:
                     Problem(f"{name}/{factor.name}: {p.path}", p.message, p.value, p.hint) for p in error.problems
                 ]
                 continue
-            content = json.dumps([resolved, study.unit], sort_keys=True, default=str)
+            search = study.clearing.model_dump() if study.clearing else None
+            content = json.dumps([resolved, study.unit, search], sort_keys=True, default=str)
             key = hashlib.sha256(content.encode()).hexdigest()[:16]
-            found.append(Case(name, factor.name, scenario.resolve(), overrides, study.unit, key))
+            found.append(Case(name, factor.name, scenario.resolve(), overrides, study.unit, key, study.clearing))
     if problems:
         raise ConfigError(problems)
     return study.title or path.stem, found
@@ -161,7 +176,19 @@ def run_case(case: Case) -> dict[str, Any]:
         **swing_figures(result.trace, case.unit),
         "cost": sum(item["cost"] for item in controllers),
         "fallbacks": sum(item["fallbacks"] for item in controllers),
+        **clearing_figures(case),
     }
+
+
+def clearing_figures(case: Case) -> dict[str, Any]:
+    """``t_crit`` [s] of a case, where it is wanted; where there is none, ``None`` and ``t_crit_note``."""
+    if case.clearing is None:
+        return {}
+    try:
+        scenario = load(case.path, (*case.overrides, *case.clearing.overrides))
+        return {"t_crit": critical_clearing_time(scenario, case.clearing.tolerance).t_crit}
+    except PgexciteError as error:
+        return {"t_crit": None, "t_crit_note": str(error)}
 
 
 def run_study(

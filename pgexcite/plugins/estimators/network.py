@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import hypot
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,20 @@ HELD = 1e-5
 LOWEST = 0.01
 """Voltage below which a phasor has no direction worth the name, pu."""
 
-Jump = tuple[float, float, float]
-"""Standard deviations of a change of the network: of ``delta``, rad, of ``x_s``, relative, and of ``v_bus``, pu."""
+
+class Jump(NamedTuple):
+    """A change of the network.
+
+    Attributes:
+        delta, x_s, v_bus: standard deviations, rad, relative, and pu.
+        left_x_s, left_v_bus: what is left of ``x_s`` and ``v_bus`` on average.
+    """
+
+    delta: float
+    x_s: float
+    v_bus: float
+    left_x_s: float = 1.0
+    left_v_bus: float = 1.0
 
 
 class Network:
@@ -123,7 +136,7 @@ class Network:
         turn = np.eye(3)
         cosine, sine = np.cos(self._turned), np.sin(self._turned)
         turn[1:, 1:] = (cosine, sine), (-sine, cosine)
-        x[self._all] = turn @ self._settled
+        x[self._all] = [jump.left_x_s, jump.left_v_bus, jump.left_v_bus] * (turn @ self._settled)
         P[self._all, :] = P[:, self._all] = 0.0
         P[self._all, self._all] = turn @ self._settled_P @ turn.T + spread(x[self._all], jump)
         return x, P
@@ -158,8 +171,7 @@ def wandered(bus: Array, delta: float, v_bus: float) -> Array:
 
 def spread(network: Array, jump: Jump) -> Array:
     """Covariance of ``(x_s, b_d, b_q)`` after a change of this kind, shape ``(3, 3)``."""
-    delta, x_s, v_bus = jump
     P = np.zeros((3, 3))
-    P[0, 0] = (x_s * network[0]) ** 2
-    P[1:, 1:] = wandered(network[1:], delta, v_bus)
+    P[0, 0] = (jump.x_s * network[0]) ** 2
+    P[1:, 1:] = wandered(network[1:], jump.delta, jump.v_bus)
     return P

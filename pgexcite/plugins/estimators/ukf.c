@@ -259,7 +259,7 @@ static void ukf_changed(const double *jump, double *x, double *P) {
     for (i = 0; i < 3; i++) {
         network[i] = 0;
         for (k = 0; k < 3; k++) {
-            network[i] += turn[i * 3 + k] * ukf_settled[k];
+            network[i] += jump[i > 0 ? 4 : 3] * (turn[i * 3 + k] * ukf_settled[k]);
             half[i * 3 + k] = 0;
             for (m = 0; m < 3; m++) half[i * 3 + k] += turn[i * 3 + m] * ukf_settled_P[m * 3 + k];
         }
@@ -317,7 +317,7 @@ static int ukf_judge(const double *z, Expectation *now, double *surprise, int *c
     ukf_unexplained += UKF_DT;
     ukf_anew = ukf_anew > 0 ? UKF_WARM_UP : 0;
     for (k = 0; k < UKF_N_JUMPS; k++) {
-        ukf_changed(UKF_JUMPS + 3 * k, x, P);
+        ukf_changed(UKF_JUMPS + 5 * k, x, P);
         if (!ukf_draw(x, P, sigmas)) return 0;
         ukf_expect(sigmas, &other);
         left = ukf_surprise(&other, z);

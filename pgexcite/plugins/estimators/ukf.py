@@ -34,10 +34,12 @@ _FORGIVE = 0.1
 
 _SWING = 4.0
 """Deviation of the speed that counts as a swing, in standard deviations of its measurement."""
-_MODERATE: Jump = (0.1, 0.3, 0.05)
+_MODERATE = Jump(0.1, 0.3, 0.05)
 """A line trips, a fault is cleared."""
-_SEVERE: Jump = (1.0, 0.1, 0.6)
-"""A fault."""
+_SEVERE = Jump(3.0, 0.3, 0.3, left_x_s=0.5, left_v_bus=0.2)
+"""A fault: little voltage is left, behind less than the whole reactance. Else a bus out of phase would explain it as well."""
+_ANY = Jump(1.0, 0.0, 0.6)
+"""What may have become of the initial point, but for ``x_s``."""
 _JUMPS = (_MODERATE, _SEVERE)
 """In the order in which they are tried."""
 _STEADY = 0.3
@@ -69,7 +71,7 @@ class UKF(BaseModel):
 
     What is measured is judged before it is used, by the normalised innovation squared (NIS). Where it is not what was expected, the
     network may have changed. Two changes are tried, both from the network as it was when it was last settled: a moderate one (a
-    line tripped, a fault cleared), then a severe one (a fault). A measurement that neither explains is left out.
+    line tripped, a fault cleared), then a severe one (a fault: most of the voltage is gone). What neither explains is left out.
 
     At rest one combination of ``delta``, ``x_s`` and ``v_bus`` cannot be seen from the terminals. ``x_s`` is therefore held while
     nothing moves, and its uncertainty with it; given ``x_s``, ``v_bus`` can be seen and is followed. The mirror image of the
@@ -278,8 +280,7 @@ class _Tracker:
         """Covariance of the initial point where next to nothing of it is certain."""
         options, layout = self.options, self.layout
         P = np.diag(self._variances(0.2, 10 * options.noise_omega, 0.1, options.noise_omega))
-        delta, _, v_bus = _SEVERE
-        P[layout.x_s :, layout.x_s :] = spread(self._start[layout.x_s :], (delta, options.spread, v_bus))
+        P[layout.x_s :, layout.x_s :] = spread(self._start[layout.x_s :], _ANY._replace(x_s=options.spread))
         return P
 
     # What is told of it.

@@ -216,6 +216,9 @@ def _translated(problem: ControlProblem, equivalent: Equivalent) -> ControlProbl
         if path not in outputs or not path.startswith(f"{unit}."):
             text = f"the equivalent knows the unit's own outputs only ({unit}.v_t, .i_fd, .delta, ...)"
             problems.append(Problem("controller", text, path))
+    if problem.known:
+        text = "the equivalent is the grid as seen from the terminals: an event in it cannot be known in advance"
+        problems.append(Problem("controller.disturbance_known", text, True, "leave it out; V_ref_known can be given"))
     if problems:
         raise ConfigError(problems)
     return replace(

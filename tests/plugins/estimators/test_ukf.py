@@ -59,7 +59,7 @@ def errors(name, seeds, *overrides):
 @pytest.mark.parametrize("name", EVENTS)
 def test_one_second_after_an_event_the_network_is_known(name):
     x_s, v_bus, _, lowest = errors(name, range(1, 4))
-    assert x_s < 0.05  # measured 0.027 and 0.046
+    assert x_s < 0.05  # measured 0.02 and 0.04
     assert v_bus < 0.02  # measured 0.005 and 0.007
     assert lowest >= 0.02
 
@@ -70,19 +70,27 @@ def test_one_second_after_an_event_the_network_is_known(name):
 def test_over_fifty_seeds_the_network_is_known_after_one_second(name, x_s_0):
     """1 % of noise; from the first second after the event to the end of the run, whatever x_s is assumed at first."""
     x_s, v_bus, sigmas, lowest = errors(name, range(1, 51), f"controller.mpc.options.estimation.x_s={x_s_0}")
-    assert x_s < 0.05  # measured 0.036 after the fault, 0.046 after the trip
+    assert x_s < 0.05  # see docs/estimation.md
     assert v_bus < 0.02  # measured 0.005 and 0.007
     assert 0.4 < sigmas < 1.3  # measured 0.55 to 0.71: the one-sigma band is honest
     assert lowest >= 0.02  # measured 0.19
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "tolerance"), [("fault_equivalent", 0.05), ("line_trip_equivalent", 0.065)])
-def test_on_standby_it_learns_less(name, tolerance):
-    """The static exciter damps the swing, and with it what can be learnt: measured 0.040 and 0.058 over fifty seeds."""
+@pytest.mark.parametrize("name", EVENTS)
+def test_on_standby_it_learns_enough(name):
+    """The static exciter damps the swing, and with it what can be learnt."""
     x_s, v_bus, _, _ = errors(name, range(1, 51), "controller.mpc.active=false")
-    assert x_s < tolerance
+    assert x_s < 0.05  # see docs/estimation.md
     assert v_bus < 0.02  # measured 0.007
+
+
+def test_a_fault_is_seen_as_little_voltage_behind_little_reactance():
+    """The arc of .02 pu at HV, with the line of .15 behind it: .12 pu behind .14 pu. A bus out of phase would explain it too."""
+    trace = reseeded(simulation("fault_equivalent", t_end=1.1), 1)
+    during = (trace.t > 1.0) & (trace.t < 1.1)
+    assert trace["controller.mpc.v_bus"][during].max() < 0.4
+    assert trace["controller.mpc.x_s"][during].max() < 0.25
 
 
 @pytest.mark.slow

@@ -281,7 +281,7 @@ def in_charge_of(unit, system, event, *, u_min, u_max, t_end=8.0, **controller):
     for name in ("x_s", "v_bus", "sigma_x_s", "delta"):
         assert np.isfinite(trace[f"controller.mpc.{name}"]).all()
     assert trace["controller.mpc.x_s"].min() >= 0.02
-    assert trace["controller.mpc.v_bus"].max() <= 1.5
+    assert trace["controller.mpc.v_bus"].max() <= 1.5 + 1e-12
     assert trace[f"{path}.e_fd"].min() >= u_min
     assert trace[f"{path}.e_fd"].max() <= u_max
     return trace
@@ -322,6 +322,21 @@ def test_where_nothing_fits_any_more_the_classical_controller_takes_over():
     assert abs(trace["unit.G2.v_t"][-1] - 1.01) < 0.01  # measured 0.001: the regulator holds it
 
 
+# Open circuit.
+
+
+def test_on_open_circuit_it_steps_the_voltage_as_if_there_were_no_grid():
+    scenario = load(CONFIGS / "smib" / "open_circuit_equivalent.toml", ["simulation.t_end=4"])
+    sim = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    assert sim.run().ending.value == "completed"
+    trace = sim.trace()
+    v = trace["unit.G2.v_t"]
+    assert v.max() - 1.0 < 0.15 * 0.05  # measured 0.026 of the step
+    outside = trace.t[np.abs(v - 1.0) > 0.05 * 0.05]
+    assert outside[-1] < 1.5  # measured 1.35: settled 0.35 s after the step
+    assert trace["controller.mpc.level"].max() == 0
+
+
 # Refusals.
 
 
@@ -334,6 +349,8 @@ def test_refusals_say_what_to_do():
         simulation(system=regulated(), command="v_ref", u_min=0.9, u_max=1.05)
     with pytest.raises(ConfigError, match=r"own outputs only.*bus\.HV\.v"):
         simulation(voltages=("bus.HV.v",))
+    with pytest.raises(ConfigError, match=r"disturbance_known.*cannot be known in advance.*V_ref_known"):
+        simulation(FAULT, disturbance_known=True)
     with pytest.raises(ConfigError, match=r"options\.model\.unit\.G2\.machine\.X_dd"):
         simulation(options={"model": {"unit.G2.machine.X_dd": 1.0}})
     with pytest.raises(ConfigError, match="one unit"):
