@@ -17,6 +17,8 @@ import proxsuite
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
+from pgexcite.core.polish import polished
+
 Array = NDArray[np.float64]
 
 _EPS = 1e-10
@@ -114,6 +116,8 @@ class QuadraticProgram:
         results = self._qp.results
         x, z = np.array(results.x), np.array(results.z)
         solved = results.info.status == proxsuite.proxqp.QPSolverOutput.PROXQP_SOLVED and bool(np.isfinite(x).all())
+        if solved:
+            x, z = polished(H, g, lower, upper, rows, rows_lower, rows_upper, x, z)
         self._multipliers = z if solved else np.zeros(m + n)
         # The tolerance leaves a bound crossed by up to eps; what reaches a plant must not be.
         return QPSolution(np.clip(x, lower, upper), z, solved, int(results.info.iter))
