@@ -101,6 +101,7 @@ class Condensed:
         self._weights[-1] *= problem.terminal
         self._twice = 2 * self._weights.ravel()
         self._n_tracked = weights.size
+        self._referred, self._targets = np.empty(0), np.empty(0)
         self._R = np.tile(problem.R, problem.N_c)
         self._move_hessian = 2 * (self._difference.T * self._R) @ self._difference
         self._lower, self._upper = np.tile(problem.u_min, problem.N_c), np.tile(problem.u_max, problem.N_c)
@@ -117,16 +118,16 @@ class Condensed:
         return (*self.problem.voltages, *self.problem.speeds, *(bound.path for bound in self.problem.soft))
 
     def _moves(self, plan: Array, u_last: Array) -> Array:
-        moves = plan.flatten()
-        moves[u_last.size :] -= plan.ravel()[: -u_last.size]
+        moves: Array = self._difference @ plan.ravel()
         moves[: u_last.size] -= u_last
         return moves
 
     def _errors(self, y: Array, references: Array) -> Array:
-        errors = y[:, : self._n_tracked].copy()
-        errors[:, : references.shape[1]] -= references
-        errors[:, references.shape[1] :] -= 1.0
-        return errors
+        if references is not self._referred:
+            # References that do not change are the same array in every sample.
+            self._referred, self._targets = references, np.ones((y.shape[0], self._n_tracked))
+            self._targets[:, : references.shape[1]] = references
+        return y[:, : self._n_tracked] - self._targets
 
     def cost(self, y: Array, references: Array, plan: Array, u_last: Array) -> float:
         """Cost of a plan, soft bounds included."""

@@ -133,7 +133,7 @@ def exchange(H: Array, g: Array, lower: Array, upper: Array, multipliers: Array)
     Returns:
         The minimiser; ``None`` where ``H`` is not positive definite, or the active set is not found in ``_MAX_EXCHANGES``.
     """
-    stationary = _STATIONARY * max(1.0, float(np.abs(g).max(initial=0.0)))
+    stationary = _STATIONARY * max(1.0, float(np.abs(g).max()))
     if not multipliers.any():
         _, x, failed = dposv(H, -g)
         if not failed and (x <= upper).all() and (x >= lower).all() and np.abs(H @ x + g).max() <= stationary:
