@@ -38,8 +38,9 @@ $inputs
 
 typedef struct {
     double command[$n_commands]; /* finite and within the bounds, whatever the input was */
-    int level;      /* 0: this plan; 1: the next move of an earlier one; 2: the last command, and the classical controller
-                       should take over; it is for the caller to come back after some samples with a usable plan */
+    int level;      /* 0: this plan; 1: the next move of an earlier one; 2: the last command, as always on standby. In charge,
+                       2 says that the classical controller should take over; it is for the caller to come back after some
+                       samples with a usable plan */
     int status;     /* how this plan was found */
     int iterations; /* quadratic programs solved */
     double cost;    /* predicted cost of this plan */$outputs

@@ -29,7 +29,8 @@ def predictions(
     selected = np.array([model.position("y", path) for path in outputs], dtype=np.int32)
     columns = len(model.x_names) + commands.size
     of_horizon, arrays = horizon(horizons)
-    # Intervals that grow are all of different lengths; a known change makes two pieces of one, and other transitions after it.
+    # Intervals that grow are all of different lengths; a known change makes two pieces of one, and other transitions after it. What
+    # is not kept is made again: many changes far apart need not all be kept.
     lengths, known = (1 if problem.growth == 1 else problem.N_p), len(problem.known)
     constants: dict[str, object] = {
         "n_commands": commands.size,
@@ -37,7 +38,7 @@ def predictions(
         "n_selected": selected.size,
         "transition": 1,
         "rule": RULES.index(rule),
-        "n_kept": lengths * (known + 1) + 2 * known,
+        "n_kept": min(lengths * (known + 1) + 2 * known, 3 * problem.N_p),
     }
     arrays |= {"COMMANDS": commands, "U_START": initial.state.u, "P_START": initial.p}
     assert functions.newton is not None
