@@ -57,8 +57,8 @@ def generate(functions: Sequence[ca.Function], constants: Mapping[str, object], 
     Args:
         functions: what the loops call.
         constants: what the loops need to know.
-        loops: files of ``c``, in order: ``step.c`` and ``advance.c`` take steps (``newton``, ``history``, ``update``; ``outputs``),
-            ``rollout.c`` and ``chain.c`` predict (the three of ``pgexcite.core.prediction.write_sensitivities``).
+        loops: files of ``c``, in order: ``step.c`` and ``advance.c`` take steps (``Kernel.stepping``; ``land``), ``rollout.c`` and
+            ``chain.c`` predict (the four of ``pgexcite.core.prediction.write_sensitivities``).
     """
     sizes = {key: max(1, *(getattr(f, key)() for f in functions)) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}
     values = {"pgexcite_public": "", **constants, **sizes}
@@ -122,9 +122,30 @@ def write_functions(functions: Sequence[ca.Function]) -> str:
     # Names need no prefix once they are static.
     arithmetic = re.sub(r"^#define casadi_\w+ CASADI_PREFIX\(\w+\)\n", "", helpers[0], flags=re.MULTILINE)
     arithmetic = re.sub(r"^(?=casadi_real casadi_)", "static ", arithmetic, flags=re.MULTILINE)
-    unused = "{\n(void)arg; (void)res; (void)iw; (void)w; (void)mem;\n"
-    parts = [arithmetic, *(body.replace("{\n", unused, 1) for body in bodies), *(f"static {name}" for name in names)]
-    return "\n".join(parts)
+    return "\n".join(
+        [
+            arithmetic,
+            *(_body(text, called=len(bodies) > len(names)) for text in bodies),
+            *(f"static {name}" for name in names),
+        ]
+    )
+
+
+def _body(text: str, *, called: bool) -> str:
+    """A function of CasADi's that reads and writes through pointers of its own, which are neither null nor overlap.
+
+    As CasADi writes it, each access looks its pointer up and compares it with zero, for any store might have changed it. Where
+    functions call each other (``called``) this is left so: they do pass null pointers.
+    """
+    if called:
+        return text.replace("{\n", "{\n(void)arg; (void)res; (void)iw; (void)w; (void)mem;\n", 1)
+    text = re.sub(r"\barg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0", r"from\1[\2]", text)
+    text = re.sub(r"\bif \(res\[(\d+)\]!=0\) res\[\1\]\[(\d+)\]=", r"to\1[\2]=", text)
+    sources, targets = (sorted(set(re.findall(rf"\b{name}(\d+)\[", text)), key=int) for name in ("from", "to"))
+    pointers = [f"const casadi_real *restrict from{k} = arg[{k}];" for k in sources]
+    pointers += [f"casadi_real *restrict to{k} = res[{k}];" for k in targets]
+    start = ["{", *pointers, "(void)arg; (void)res; (void)iw; (void)w; (void)mem;", ""]
+    return text.replace("{\n", "\n".join(start), 1)
 
 
 def build(source: str, *, only_cached: bool = False) -> Path | None:

@@ -237,35 +237,34 @@ class _Unrolled:
 
     def __init__(self, kernel: Kernel, x: ca.SX, z: ca.SX, u: ca.SX, p: ca.SX) -> None:
         assert kernel.functions.newton is not None, "one machine is never too large to be written out"
-        self._newton_step, self._history, self._outputs = (
-            kernel.functions.newton,
-            kernel.functions.history,
-            kernel.functions.outputs,
-        )
-        self._given = (ca.SX(0, 1), u, p)
-        self.x = x
-        _, mass = self._history(x, z, *self._given, 0.0)
+        self._functions, self._newton_step = kernel.functions, kernel.functions.newton
+        self._given, self.x = (ca.SX(0, 1), u, p), x
+        self._q, mass, _ = self._functions.prepare(FROZEN, *self._given)
         # The algebraic unknowns at the states given.
-        self.z = self._newton(ca.vertcat(x, z), mass * x, FROZEN)[x.numel() :]
+        self.z = self._newton(ca.vertcat(x, z), mass * x)[x.numel() :]
 
-    def _newton(self, w: ca.SX, b: ca.SX, c: float) -> ca.SX:
+    def _newton(self, w: ca.SX, b: ca.SX) -> ca.SX:
         for _ in range(_NEWTON):
-            w = self._newton_step(w, b, c, *self._given)[0]
+            w = self._newton_step(w, b, self._q)[0]
         return w
 
     def step(self, h: float) -> None:
         """Move on by ``h`` seconds."""
         n, c = self.x.numel(), GAMMA * h / 2
-        b, mass = self._history(self.x, self.z, *self._given, c)
+        self._q, mass, _ = self._functions.prepare(c, *self._given)
         start = ca.vertcat(self.x, self.z)
-        middle = self._newton(start, b, c)
+        middle = self._newton(start, mass * self.x + c * self._land()[1])
         b = mass * (ALPHA * middle[:n] - BETA * self.x)
-        w = self._newton(middle + ((1 - GAMMA) / GAMMA) * (middle - start), b, c)
+        w = self._newton(middle + ((1 - GAMMA) / GAMMA) * (middle - start), b)
         self.x, self.z = w[:n], w[n:]
 
     def outputs(self) -> ca.SX:
         """All outputs of the model here."""
-        return self._outputs(self.x, self.z, *self._given)
+        return self._land()[2]
+
+    def _land(self) -> Any:
+        w, b = ca.vertcat(self.x, self.z), ca.SX.zeros(self.x.numel())
+        return self._functions.land(w, b, self._q, self._given[0])
 
 
 def _system(device: Device, f_n: float, at: Terminals, x_s: float) -> System:

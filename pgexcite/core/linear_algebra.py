@@ -1,13 +1,14 @@
 """Sparse LU written out symbolically in a fixed order, so that one Newton iteration is one straight-line function.
 
 Equations are first paired with unknowns by a maximum-product matching (without it a lossless network has zero pivots on its
-diagonal), then the pairs are eliminated in Markowitz order (minimum fill). The same factors serve any number of right-hand sides.
+diagonal), then the pairs are eliminated in order of least fill. The same factors serve any number of right-hand sides.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from heapq import heapify, heappop, heappush
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -19,6 +20,8 @@ from pgexcite.core.errors import AssemblyError
 
 Array = NDArray[np.float64]
 
+_WEAKEST = 1e-2
+"""Pivot that is eliminated without waiting, relative to its row or its column."""
 _NEVER = 1e-30
 """Magnitude given to an entry that is zero in some of the samples: chosen as a pivot only where there is no other way."""
 
@@ -56,76 +59,174 @@ def _row_scaled(sample: Array) -> Array:
     return sample / np.where(largest > 0, largest, 1.0)
 
 
+class Entry(NamedTuple):
+    """A coefficient of a system.
+
+    Attributes:
+        value: expression.
+        online: whether it has to be computed anew in every iteration.
+        samples: its value at several points.
+    """
+
+    value: Any
+    online: bool
+    samples: Array
+
+
+Rows = dict[int, dict[int, Entry]]
+"""A sparse system: for each unknown the row it is eliminated with, as coefficients by unknown."""
+
+
+def matrix_rows(matrix: ca.SX, pairing: NDArray[np.intp]) -> Rows:
+    """A matrix as a system, all of it computed in every iteration and known at no point."""
+    unknown_of = {int(row): column for column, row in enumerate(pairing)}
+    rows: Rows = {k: {} for k in range(matrix.shape[0])}
+    for i, j, value in zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True):
+        rows[unknown_of[i]][j] = Entry(value, True, np.zeros(0))
+    return rows
+
+
+def _product(a: Entry, b: Entry) -> Entry:
+    return Entry(a.value * b.value, a.online or b.online, a.samples * b.samples)
+
+
+def _difference(a: Entry | None, b: Entry) -> Entry:
+    if a is None:
+        return Entry(-b.value, b.online, -b.samples)
+    return Entry(a.value - b.value, a.online or b.online, a.samples - b.samples)
+
+
 class SymbolicLU:
-    """Factors of a sparse SX matrix, written out.
+    """Factors of a sparse system of expressions, written out.
+
+    Unknowns are eliminated in order of least fill, and among these where least is to be computed in every iteration. One whose
+    pivot changes its sign between the sample points, or is small beside both its row and its column at any of them, waits for
+    others to be eliminated: somewhere between two rotor angles its pivot is zero.
+
+    Args:
+        rows: the system; used up.
 
     Attributes:
         pivots: the pivots as expressions, in order of elimination.
         entries: number of nonzeros of the factors.
     """
 
-    def __init__(self, matrix: ca.SX, pairing: NDArray[np.intp]) -> None:
-        n = matrix.shape[0]
-        row_of = {int(row): col for col, row in enumerate(pairing)}
-        rows: list[dict[int, Any]] = [{} for _ in range(n)]
-        entry_rows, entry_cols = matrix.sparsity().get_triplet()
-        for value, i, j in zip(matrix.nonzeros(), entry_rows, entry_cols, strict=True):
-            rows[row_of[i]][j] = value
-        self._pairing = pairing
-        self._steps: list[tuple[int, list[tuple[int, Any]], dict[int, Any]]] = []
-        self._eliminate(rows)
-        self.pivots = [upper[k] for k, _, upper in self._steps]
-        self.entries = sum(len(lower) + len(upper) for _, lower, upper in self._steps)
-
-    def _eliminate(self, rows: list[dict[int, Any]]) -> None:
-        n = len(rows)
-        users: list[set[int]] = [set() for _ in range(n)]
-        for i, row in enumerate(rows):
+    def __init__(self, rows: Rows) -> None:
+        self._rows = rows
+        self._steps: list[tuple[int, list[tuple[int, Any]], list[tuple[int, Any]], Any]] = []
+        self.pivots: list[Any] = []
+        self._users: dict[int, set[int]] = {k: set() for k in rows}
+        for i, row in rows.items():
             for j in row:
-                users[j].add(i)
-        left = set(range(n))
-        while left:
-            k = min(left, key=lambda c: ((len(rows[c]) - 1) * (len(users[c]) - 1), c))
-            left.remove(k)
-            pivot_row = rows[k]
-            inverse = 1 / pivot_row[k]
-            lower = []
-            for i in sorted(users[k] - {k}):
-                factor = rows[i].pop(k) * inverse
-                lower.append((i, factor))
-                for j, value in pivot_row.items():
-                    if j == k:
-                        continue
-                    rows[i][j] = rows[i][j] - factor * value if j in rows[i] else -factor * value
-                    users[j].add(i)
-            for j in pivot_row:
-                users[j].discard(k)
-            users[k] = set()
-            self._steps.append((k, lower, dict(pivot_row)))
+                self._users[j].add(i)
+        with np.errstate(all="ignore"):
+            self._eliminate()
+        self.entries = sum(1 + len(lower) + len(upper) for _, lower, upper, _ in self._steps)
 
-    def solve(self, rhs: ca.SX) -> ca.SX:
-        """Solve for one or more right-hand sides, shape ``(n, m)``; structural zeros of ``rhs`` cost nothing."""
+    def _cost(self, k: int) -> tuple[int, int, int] | None:
+        """Order in which an unknown comes up; ``None`` while its row does not contain it."""
+        row, users, rows = self._rows[k], self._users[k], self._rows
+        if k not in row:
+            return None
+        keys, fill = row.keys(), 0
+        for i in users:
+            fill += len(keys - rows[i].keys())
+        online = row[k].online
+        idle_rows = 0 if online else sum(not rows[i][k].online for i in users) - 1
+        idle_columns = sum(not entry.online for entry in row.values()) - (not online)
+        work = (len(users) - 1) * (len(row) - 1) - idle_rows * idle_columns
+        return (fill, work, k)
+
+    def _eliminate(self) -> None:
+        costs = {k: self._cost(k) for k in self._rows}
+        queue = [cost for cost in costs.values() if cost is not None]
+        heapify(queue)
+        waiting: list[tuple[float, int]] = []
+        while queue or waiting:
+            if queue:
+                k = queue[0][-1]
+                if costs.get(k) != heappop(queue):
+                    continue
+                strength = self._strength(k)
+                if not strength > _WEAKEST:
+                    heappush(waiting, (-strength, k))
+                    costs[k] = None
+                    continue
+            else:
+                k = heappop(waiting)[1]
+                if costs.get(k, k) is not None:
+                    continue
+            del costs[k]
+            for j in self._eliminate_one(k):
+                cost = self._cost(j)
+                if cost != costs[j]:
+                    costs[j] = cost
+                    if cost is not None:
+                        heappush(queue, cost)
+        if costs:
+            raise AssemblyError("the equations are structurally singular: an unknown is in no equation that is left")
+
+    def _strength(self, k: int) -> float:
+        """Least magnitude of a pivot beside its row or column, whichever is smaller; zero where its sign changes."""
+        row, pivot = self._rows[k], self._rows[k][k].samples
+        if not pivot.size:
+            return 1.0
+        if (pivot > 0).any() and (pivot < 0).any():
+            return 0.0
+        largest = [
+            np.abs(entries).max(axis=0)
+            for entries in (
+                [entry.samples for entry in row.values()],
+                [self._rows[i][k].samples for i in self._users[k]],
+            )
+        ]
+        return float(np.nanmin(np.abs(pivot) / np.minimum(*largest), initial=1.0))
+
+    def _eliminate_one(self, k: int) -> set[int]:
+        """Eliminate an unknown; which ones this changes the cost of."""
+        row, users = self._rows.pop(k), self._users.pop(k) - {k}
+        pivot = row.pop(k)
+        inverse = Entry(1 / pivot.value, pivot.online, 1 / pivot.samples)
+        lower, touched = [], set(users)
+        for i in sorted(users):
+            target = self._rows[i]
+            entry = target.pop(k)
+            factor = _product(entry, inverse)
+            lower.append((i, factor.value))
+            for j, value in row.items():
+                product = _product(factor, value)
+                target[j] = _difference(target.get(j), product)
+                self._users[j].add(i)
+            touched.update(target)
+        for j in row:
+            self._users[j].discard(k)
+            touched.update(self._users[j])
+        self.pivots.append(pivot.value)
+        self._steps.append((k, lower, [(j, entry.value) for j, entry in row.items()], inverse.value))
+        return touched | row.keys()
+
+    def solve(self, rhs: ca.SX, pairing: NDArray[np.intp]) -> ca.SX:
+        """Solve for the first ``n`` unknowns; the rows of all others have zeros on the right.
+
+        Args:
+            rhs: one or more right-hand sides, shape ``(n, m)``; structural zeros cost nothing.
+            pairing: row of ``rhs`` that belongs to each of these unknowns.
+        """
         n, m = rhs.shape
-        columns = []
+        has, solution = rhs.sparsity(), []
         for column in range(m):
-            b: list[Any] = [0] * n
-            for k in range(n):
-                row = int(self._pairing[k])
-                b[k] = rhs[row, column] if rhs.sparsity().has_nz(row, column) else 0
-            for k, lower, _ in self._steps:
-                if not _is_zero(b[k]):
+            b = {k: rhs[int(row), column] for k, row in enumerate(pairing) if has.has_nz(int(row), column)}
+            for k, lower, _, _ in self._steps:
+                if k in b and not b[k].is_zero():
                     for i, factor in lower:
-                        b[i] = b[i] - factor * b[k]
-            x: list[Any] = [0] * n
-            for k, _, upper in reversed(self._steps):
-                total = b[k]
-                for j, value in upper.items():
-                    if j != k and not _is_zero(x[j]):
+                        b[i] = b[i] - factor * b[k] if i in b else -factor * b[k]
+            x: dict[int, Any] = {}
+            for k, _, upper, inverse in reversed(self._steps):
+                total = b.get(k, 0)
+                for j, value in upper:
+                    if j in x:
                         total = total - value * x[j]
-                x[k] = 0 if _is_zero(total) else total / upper[k]
-            columns.append(ca.vertcat(*x))
-        return ca.horzcat(*columns) if columns else ca.SX(n, 0)
-
-
-def _is_zero(value: Any) -> bool:
-    return isinstance(value, int) or bool(value.is_zero())
+                if isinstance(total, ca.SX) and not total.is_zero():
+                    x[k] = total * inverse
+            solution.append(ca.vertcat(*(x.get(k, 0) for k in range(n))))
+        return ca.horzcat(*solution) if solution else ca.SX(n, 0)

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.codegen import build, generate, load
-from pgexcite.core.linear_algebra import SymbolicLU
+from pgexcite.core.hoist import hoist, jacobian
 from pgexcite.core.model import State
 from pgexcite.core.settings import Rule
-from pgexcite.core.stage import ALPHA, BETA, FROZEN, write_stage
+from pgexcite.core.stage import ALPHA, BETA, FROZEN
 from pgexcite.core.step import RULES, STARTUP_STEPS, Kernel, bind
 
 Array = NDArray[np.float64]
@@ -134,30 +134,22 @@ class Predictor:
         columns = n_x + n_u if self.transitions else n_moves * n_u
         self._functions = write_sensitivities(kernel, self._commands, self._outputs, columns)
         self._library = self._compile(columns)
-        self._commands_at = _address(self._commands)
-        stage, history, output = self._functions
-        k, rows = kernel, (kernel.w.size, n_x, n_u, self._outputs.size)
+        rows = (kernel.w.size, n_x, n_u, self._outputs.size)
         # CasADi keeps matrices column by column, so a row of these arrays is a column of the sensitivity.
         self._S, self._S_b, self._S_c, self._S_y = (np.zeros((columns, n)) for n in rows)
-        self._S_new = np.zeros_like(self._S)
-        given = [k.d, k.u, k.p]
-        S, S_b, S_c, S_y, S_new = (a.reshape(-1) for a in (self._S, self._S_b, self._S_c, self._S_y, self._S_new))
-        self._x, self._z = np.zeros(n_x), np.zeros(k.z.size)
-        self._stage = bind(stage, [k.w, k.b, k.c, *given, S_b, S_c], [S_new])
-        self._stage_middle = bind(stage, [k.middle, k.b_middle, k.c, *given, S_b, S_c], [S_new])
-        self._history = bind(history, [self._x, self._z, *given, k.c, S, S_c], [S_b])
-        self._y = np.zeros(self._outputs.size)
-        self._call = _Call([np.zeros(n) for n in (n_x, k.z.size, k.d.size)], n_moves * n_u)
-        self._output = bind(output, [k.x, k.z, *given, S, S_c], [self._y, S_y])
+        self._S_new, self._S_slope = np.zeros_like(self._S), np.zeros_like(self._S_b)
+        self._w, self._b, self._y = np.zeros(kernel.w.size), np.zeros(n_x), np.zeros(self._outputs.size)
+        self._sensing = [_Sensing(self) for _ in range(2)]
+        self._commands_at = _address(self._commands)
+        self._call = _Call([np.zeros(n) for n in (n_x, kernel.z.size, kernel.d.size)], n_moves * n_u)
 
     def _compile(self, columns: int) -> ctypes.CDLL | None:
-        functions = self._kernel.functions
-        if not self._kernel.compiled or functions.newton is None:
+        if not self._kernel.compiled:
             return None
         sizes = {"n_commands": self._commands.size, "n_columns": columns, "n_selected": self._outputs.size}
-        called = [functions.newton, functions.history, functions.update, *self._functions]
-        constants = self._kernel.constants() | sizes | {"transition": int(self.transitions)}
-        library = build(generate(called, constants, ["step.c", "rollout.c", "chain.c"]))
+        sizes |= {"transition": int(self.transitions), "n_sense_hoisted": self._functions[0].numel_out(0)}
+        called, loops = [*self._kernel.stepping(), *self._functions], ["step.c", "rollout.c", "chain.c"]
+        library = build(generate(called, self._kernel.constants() | sizes, loops))
         return None if library is None else load(library)
 
     def roll(self, state: State, moves: Array, horizon: Horizon, *, derivatives: bool) -> Rollout | None:
@@ -172,7 +164,7 @@ class Predictor:
         Returns:
             The prediction, or ``None`` where the model cannot be stepped over the horizon.
         """
-        N, (columns, n_x) = int(horizon.ends.sum()), (self._S.shape[0], self._x.size)
+        N, (columns, n_x) = int(horizon.ends.sum()), (self._S.shape[0], self._b.size)
         y = np.empty((N, self._outputs.size))
         dy = np.zeros((N, columns, self._outputs.size)) if derivatives else np.zeros((0, 0, 0))
         dx = np.zeros((N, columns, n_x)) if derivatives and self.transitions else np.zeros((0, 0, 0))
@@ -194,7 +186,7 @@ class Predictor:
         Returns:
             The transition, or ``None`` where the model cannot be stepped.
         """
-        kernel, (columns, n_x), n_y = self._kernel, (self._S.shape[0], self._x.size), self._outputs.size
+        kernel, (columns, n_x), n_y = self._kernel, (self._S.shape[0], self._b.size), self._outputs.size
         segment = kernel.advance(state, p, self._rule, h, count)
         y, dy, dx = np.zeros((1, n_y)), np.zeros((1, columns, n_y)), np.zeros((1, columns, n_x))
         roll = self._roll if self._library is None else self._roll_compiled
@@ -209,12 +201,12 @@ class Predictor:
 
     def outputs(self, state: State, p: Array) -> tuple[Array, Array, Array]:
         """Selected outputs at a point and their derivatives to the states and to the commands; needs ``transitions=True``."""
-        n_x = self._x.size
+        n_x = self._b.size
         self._kernel.begin(state, p)
         self._S[:], self._S_c[:] = 0.0, 0.0
         self._point_at(0, fresh=True)
         self._sense_settling()
-        self._output.trigger()
+        self._sense_outputs()
         slope = self._S_y.T.copy()
         return self._y.copy(), slope[:, :n_x], slope[:, n_x:]
 
@@ -238,7 +230,7 @@ class Predictor:
 
     def _condense(self, moves: NDArray[np.int32], dy: Array, dx: Array) -> Array:
         """Chained transitions, shape ``(N, n_y, n_x + n_moves * n_u)``."""
-        N, n_x, n_u = len(moves), self._x.size, self._commands.size
+        N, n_x, n_u = len(moves), self._b.size, self._commands.size
         columns = n_x + self._n_moves * n_u
         G = np.empty((N, columns, self._outputs.size))
         if self._library is not None:
@@ -277,12 +269,12 @@ class Predictor:
                 startup = stepped
             fresh = bool(horizon.ends[j])
             if fresh:
-                self._output.trigger()
+                self._sense_outputs()
                 y[sample] = self._y
                 if sense:
                     dy[sample] = self._S_y
                 if dx.size:
-                    dx[sample] = self._S[:, : self._x.size]
+                    dx[sample] = self._S[:, : self._b.size]
                 sample += 1
         return True
 
@@ -302,7 +294,7 @@ class Predictor:
         """Directions of the sensitivities: the commands of a move, or each state and each command by itself."""
         if self.transitions and not fresh:
             return
-        n_x, n_u = self._x.size, self._commands.size
+        n_x, n_u = self._b.size, self._commands.size
         self._S_c[:] = 0.0
         if self.transitions:
             self._S[:] = 0.0
@@ -314,7 +306,6 @@ class Predictor:
     def _take(self, h: float, startup: int, *, sense: bool) -> int | None:
         """One step; the startup steps left, ``None`` where it cannot be taken."""
         kernel = self._kernel
-        self._x[:], self._z[:] = kernel.x, kernel.z
         if not kernel.take(self._rule, h, startup, pivoting=False):
             return None
         if sense:
@@ -325,26 +316,62 @@ class Predictor:
             return STARTUP_STEPS
         return max(startup - 1, 0)
 
+    def _aim(self, c: float) -> _Sensing:
+        """Have the values at hand that are hoisted out of the sensitivities of stages with this coefficient."""
+        sensing = self._sensing[c == FROZEN]
+        if sensing.of != (self._kernel.renewals, c):
+            sensing.c[0] = c
+            sensing.prepare.trigger()
+            sensing.of = (self._kernel.renewals, c)
+        return sensing
+
     def _sense_settling(self) -> None:
-        kernel = self._kernel
-        kernel.c[0] = FROZEN
-        kernel.w[: kernel.x.size], kernel.w[kernel.x.size :] = kernel.x, kernel.z
-        np.multiply(kernel.mass, kernel.x, out=kernel.b)
-        self._S_b[:] = self._S[:, : kernel.x.size] * kernel.mass
-        self._stage.trigger()
+        kernel, n_x = self._kernel, self._b.size
+        kernel.aim(FROZEN)
+        self._w[:n_x], self._w[n_x:] = kernel.x, kernel.z
+        np.multiply(kernel.mass, kernel.x, out=self._b)
+        self._S_b[:] = self._S[:, :n_x] * kernel.mass
+        self._aim(FROZEN).settled.trigger()
         self._S[:] = self._S_new
 
     def _sense_step(self, *, euler: bool) -> None:
-        kernel, n_x = self._kernel, self._kernel.x.size
-        if self._rule == "backward_euler" or euler:
-            self._S_b[:] = self._S[:, :n_x] * kernel.mass
-        else:
-            self._history.trigger()
+        kernel, n_x = self._kernel, self._b.size
+        c = float(kernel.c[0])
+        sensing = self._aim(c)
+        self._S_b[:] = self._S[:, :n_x] * kernel.mass
+        if not (self._rule == "backward_euler" or euler):
+            sensing.slope.trigger()
+            self._S_b += c * self._S_slope
             if self._rule == "tr_bdf2":
-                self._stage_middle.trigger()
+                sensing.middle.trigger()
                 self._S_b[:] = kernel.mass * (ALPHA * self._S_new[:, :n_x] - BETA * self._S[:, :n_x])
-        self._stage.trigger()
+        sensing.stage.trigger()
         self._S[:] = self._S_new
+
+    def _sense_outputs(self) -> None:
+        kernel, n_x = self._kernel, self._b.size
+        self._w[:n_x], self._w[n_x:] = kernel.x, kernel.z
+        self._aim(float(kernel.c[0])).outputs.trigger()
+
+
+class _Sensing:
+    """The values hoisted out of the sensitivities of stages with one coefficient ``c``, and the functions bound to them.
+
+    Attributes:
+        of: ``renewals`` of the kernel and ``c`` that the values belong to.
+    """
+
+    def __init__(self, predictor: Predictor) -> None:
+        k, s = predictor._kernel, predictor
+        prepare, stage, slope, output = s._functions
+        self.of, self.c, q = (-1, np.nan), np.zeros(1), np.zeros(prepare.numel_out(0))
+        S, S_b, S_c, S_y, S_new, S_slope = (a.reshape(-1) for a in (s._S, s._S_b, s._S_c, s._S_y, s._S_new, s._S_slope))
+        self.prepare = bind(prepare, [self.c, k.d, k.u, k.p], [q])
+        self.stage = bind(stage, [k.w, k.b, q, S_b, S_c], [S_new])
+        self.middle = bind(stage, [k.middle, k.b_middle, q, S_b, S_c], [S_new])
+        self.settled = bind(stage, [s._w, s._b, q, S_b, S_c], [S_new])
+        self.slope = bind(slope, [k.start, q, S, S_c], [S_slope])
+        self.outputs = bind(output, [s._w, q, k.d, S, S_c], [s._y, S_y])
 
 
 class _Call:
@@ -379,34 +406,37 @@ def _address(array: NDArray[Any]) -> ctypes.c_void_p:
 
 def write_sensitivities(
     kernel: Kernel, commands: NDArray[np.int32], outputs: NDArray[np.int32], columns: int
-) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Derivatives of a stage, of its history and of the selected outputs to ``columns`` moves.
+) -> tuple[ca.Function, ca.Function, ca.Function, ca.Function]:
+    """Derivatives of a stage, of the slope and of the selected outputs to ``columns`` moves.
 
-    ``stage_sensitivity(w, b, c, d, u, p, S_b, S_c) -> S_w``, ``history_sensitivity(x, z, d, u, p, c, S_w, S_c) -> S_b`` and
-    ``output_sensitivity(x, z, d, u, p, S_w, S_c) -> (y, S_y)``; ``S_c`` has a row for each command.
+    ``prepare_sensitivity(c, d, u, p) -> q``, ``stage_sensitivity(w, b, q, S_b, S_c) -> S_w``,
+    ``slope_sensitivity(w, q, S_w, S_c) -> S_slope`` and ``output_sensitivity(w, q, d, S_w, S_c) -> (y, S_y)``;
+    ``S_c`` has a row for each command.
     """
-    model = kernel.model
-    n_x, n_z = len(model.x_names), len(model.z_names)
-    stage = write_stage(model)
-    S_w, S_b = ca.SX.sym("S_w", n_x + n_z, columns), ca.SX.sym("S_b", n_x, columns)
+    stage, n_x, factors = kernel.stage, kernel.x.size, kernel.functions.factors
+    assert factors is not None, "too large to be written out"
+    S_w, S_b = ca.SX.sym("S_w", stage.w.numel(), columns), ca.SX.sym("S_b", n_x, columns)
     S_c = ca.SX.sym("S_c", commands.size, columns)
-    chosen = [int(k) for k in commands]
-    rhs = ca.mtimes(ca.jacobian(stage.r, stage.b), S_b) + ca.mtimes(ca.jacobian(stage.r, stage.u)[:, chosen], S_c)
-    solved = -SymbolicLU(stage.jacobian, kernel.functions.pairing).solve(ca.densify(rhs))
-    given = [stage.d, stage.u, stage.p]
-    options = {"cse": True}
-    of_stage = ca.Function(
-        "stage_sensitivity", [stage.w, stage.b, stage.c, *given, S_b, S_c], [ca.densify(solved)], options
-    )
-    x, z = ca.SX.sym("x", n_x), ca.SX.sym("z", n_z)
-    b = kernel.functions.history(x, z, *given, stage.c)[0]
-    y = kernel.functions.outputs(x, z, *given)[[int(k) for k in outputs]]
-    S_x, S_z = S_w[:n_x, :], S_w[n_x:, :]
+    # The commands act through what is hoisted.
+    by_command = ca.jacobian(stage.values, stage.u[commands.tolist()])
+    acting = sorted(set(by_command.sparsity().row()))
+
+    def by_commands(expression: ca.SX) -> ca.SX:
+        return ca.mtimes(ca.mtimes(ca.jacobian(expression, stage.q[acting]), by_command[acting, :]), S_c)
 
     def along(expression: ca.SX) -> ca.SX:
-        total = ca.mtimes(ca.jacobian(expression, x), S_x) + ca.mtimes(ca.jacobian(expression, z), S_z)
-        return ca.densify(total + ca.mtimes(ca.jacobian(expression, stage.u)[:, chosen], S_c))
+        return ca.densify(ca.mtimes(jacobian(expression, stage.w), S_w) + by_commands(expression))
 
-    of_history = ca.Function("history_sensitivity", [x, z, *given, stage.c, S_w, S_c], [along(b)], options)
-    of_output = ca.Function("output_sensitivity", [x, z, *given, S_w, S_c], [ca.densify(y), along(y)], options)
-    return of_stage, of_history, of_output
+    y = stage.y[outputs.tolist()]
+    rhs = ca.mtimes(ca.jacobian(stage.r, stage.b), S_b) + by_commands(stage.r)
+    solved = -ca.densify(factors.solve(rhs, kernel.functions.pairing))
+    fixed = [stage.q, stage.c, stage.d[np.flatnonzero(stage.switching).tolist()], stage.u, stage.p]
+    hoisted = hoist([solved, along(stage.slope), y, along(y)], fixed)
+    S_next, S_slope, y, S_y = hoisted.expressions
+    w, q, options = stage.w, hoisted.q, {"cse": True}
+    return (
+        ca.Function("prepare_sensitivity", stage.parameters, stage.in_parameters([hoisted.values]), options),
+        ca.Function("stage_sensitivity", [w, stage.b, q, S_b, S_c], [S_next], options),
+        ca.Function("slope_sensitivity", [w, q, S_w, S_c], [S_slope], options),
+        ca.Function("output_sensitivity", [w, q, stage.d, S_w, S_c], [y, S_y], options),
+    )

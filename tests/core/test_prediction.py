@@ -144,6 +144,9 @@ def test_c_gives_the_same_numbers(rule, transitions):
     a, b = roll(sim, in_vm, MOVES, derivatives=True), roll(sim, in_c, MOVES, derivatives=True)
     assert np.abs(a.y - b.y).max() < 1e-9  # measured 0
     assert np.abs(a.dy - b.dy).max() < 1e-9  # measured 0
+    # Without derivatives, in a library that has not computed any.
+    _, in_c = swinging(rule, compiled="always", transitions=transitions)
+    assert np.array_equal(roll(sim, in_c, MOVES).y, b.y)
 
 
 def test_a_horizon_that_cannot_be_stepped_gives_no_prediction():

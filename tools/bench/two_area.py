@@ -28,19 +28,21 @@ import json, sys, time
 import andes
 andes.config_logger(50)
 t_end = float(sys.argv[1])
-system = andes.load(andes.get_case("kundur/kundur_full.xlsx"), setup=False, no_output=True, default_config=True)
-system.Toggle.u.v[:] = [0.0] * len(system.Toggle.u.v)
-if system.Fault.n:
-    system.Fault.u.v[:] = [0.0] * len(system.Fault.u.v)
-system.add("Fault", dict(bus=7, tf=1.0, tc=1.1, xf=1e-4, rf=0.0, u=1))
-system.setup()
-system.PFlow.run()
-config = system.TDS.config
-config.tf, config.tstep, config.fixt, config.shrinkt, config.tol, config.no_tqdm = t_end, {H!r}, 1, 1, {TOLERANCE!r}, 1
-system.TDS.init()
-began = time.perf_counter()
-done = system.TDS.run()
-spent = time.perf_counter() - began
+# Whatever a first run prepares is left out: the second is timed.
+for _ in range(2):
+    system = andes.load(andes.get_case("kundur/kundur_full.xlsx"), setup=False, no_output=True, default_config=True)
+    system.Toggle.u.v[:] = [0.0] * len(system.Toggle.u.v)
+    if system.Fault.n:
+        system.Fault.u.v[:] = [0.0] * len(system.Fault.u.v)
+    system.add("Fault", dict(bus=7, tf=1.0, tc=1.1, xf=1e-4, rf=0.0, u=1))
+    system.setup()
+    system.PFlow.run()
+    config = system.TDS.config
+    config.tf, config.tstep, config.fixt, config.shrinkt, config.tol, config.no_tqdm = t_end, {H!r}, 1, 1, {TOLERANCE!r}, 1
+    system.TDS.init()
+    began = time.perf_counter()
+    done = system.TDS.run()
+    spent = time.perf_counter() - began
 steps = len(system.dae.ts.t)
 print(json.dumps(dict(version=andes.__version__, converged=bool(done), steps=steps, microseconds=1e6 * spent / steps)))
 """

@@ -46,17 +46,16 @@ static void move_point(const double *x, const double *u) {
 }
 
 /* Outputs at a point and their derivatives to states and commands. */
-static void sense_outputs(const double *x, const double *z, const double *d, const double *u, const double *p, double *y,
-                          double *to_y) {
+static void outputs_of(const double *x, const double *z, const double *d, const double *u, const double *p, double *y,
+                       double *to_y) {
     static Stage s;
-    s.d = d; s.u = u; s.p = p; s.c = 0;
-    history_at(&s, x, z);
+    s.d = d; s.u = u; s.p = p;
+    renewed(&s);
+    aim(&s, FROZEN);
     memset(S, 0, sizeof S); memset(S_c, 0, sizeof S_c);
     point_at(0, 1);
     sense_settling(&s, x, z);
-    args[0] = x; args[1] = z; args[2] = d; args[3] = u; args[4] = p; args[5] = S; args[6] = S_c;
-    results[0] = y; results[1] = to_y;
-    output_sensitivity(args, results, iwork, work, 0);
+    sense_outputs(&s, x, z, y, to_y);
 }
 
 /* To the point, with other set-points and parameters in force: its algebraic unknowns are solved again. */
@@ -66,8 +65,8 @@ static int go_to_point(const double *wanted, const double *p, double *x, double 
     memcpy(x, point_x, sizeof point_x); memcpy(z, POINT_Z, sizeof(double) * N_Z); memcpy(d, POINT_D, sizeof(double) * N_D);
     memcpy(u, wanted, sizeof(double) * N_U);
     for (i = 0; i < N_COMMANDS; i++) u[COMMANDS[i]] = point_u[i];
-    s.d = d; s.u = u; s.p = p; s.c = 0;
-    history_at(&s, x, z);
+    s.d = d; s.u = u; s.p = p;
+    renewed(&s);
     return settle(&s, x, z);
 }
 
@@ -79,7 +78,7 @@ static int linearise(int count, double h, const double *wanted, const double *p,
     if (pgexcite_rollout(RULE, 1, &count, &h, &first, &first, &ends, COMMANDS, STARTUP_STEPS, to->x, z, d, p, u, point_u, 1, y, dy,
                          to->to_x) != 1)
         return 0;
-    sense_outputs(to->x, z, d, u, p, to->y, to->to_y);
+    outputs_of(to->x, z, d, u, p, to->y, to->to_y);
     return all_finite(to->to_x, N_COLUMNS * N_X) && all_finite(to->to_y, N_X * N_SELECTED);
 }
 
@@ -170,7 +169,7 @@ static int outputs_at(double t, const double *u, Transition *to) {
     int i;
     in_force(t, others, p);
     if (!go_to_point(others, p, here.x, z, d, all)) return 0;
-    sense_outputs(here.x, z, d, all, p, here.y, here.to_y);
+    outputs_of(here.x, z, d, all, p, here.y, here.to_y);
     for (i = 0; i < N_COMMANDS; i++) du[i] = u[i] - point_u[i];
     for (i = 0; i < N_SELECTED; i++) to->y[i] = output_linear(&here, i, to->x, du);
     memcpy(to->to_y, here.to_y, sizeof to->to_y);

@@ -59,8 +59,8 @@ static int predict(const Point *from, const Horizon *over, const double *moves, 
 static int settle_at(Point *at, const double *u, const double *p) {
     static Stage s;
     memcpy(at->u, u, sizeof at->u);
-    s.d = at->d; s.u = at->u; s.p = p; s.c = 0;
-    history_at(&s, at->x, at->z);
+    s.d = at->d; s.u = at->u; s.p = p;
+    renewed(&s);
     at->startup = STARTUP_STEPS;
     return settle(&s, at->x, at->z);
 }

@@ -24,7 +24,7 @@ def predictions(
     kernel: Kernel, initial: Initial, horizons: Horizons, outputs: Sequence[str], rule: Rule
 ) -> tuple[list[ca.Function], dict[str, object], dict[str, Numbers]]:
     """Functions, constants and arrays of linear predictions of these outputs around points of a model."""
-    model, problem, functions = kernel.model, horizons.problem, kernel.functions
+    model, problem = kernel.model, horizons.problem
     commands = np.array([model.position("u", path) for path in problem.commands], dtype=np.int32)
     selected = np.array([model.position("y", path) for path in outputs], dtype=np.int32)
     columns = len(model.x_names) + commands.size
@@ -41,10 +41,9 @@ def predictions(
         "n_kept": min(lengths * (known + 1) + 2 * known, 3 * problem.N_p),
     }
     arrays |= {"COMMANDS": commands, "U_START": initial.state.u, "P_START": initial.p}
-    assert functions.newton is not None
-    called = [functions.newton, functions.history, functions.update]
-    called += write_sensitivities(kernel, commands, selected, columns)
-    return called, kernel.constants() | constants | of_horizon, arrays
+    sensitivities = write_sensitivities(kernel, commands, selected, columns)
+    constants["n_sense_hoisted"] = sensitivities[0].numel_out(0)
+    return [*kernel.stepping(), *sensitivities], kernel.constants() | constants | of_horizon, arrays
 
 
 def filtering(observer: OffsetFreeFilter) -> tuple[dict[str, object], dict[str, Numbers]]:

@@ -107,7 +107,7 @@ def refuse(where: str, shooting: Shooting) -> None:
 def planning(shooting: Shooting) -> tuple[list[ca.Function], dict[str, object], dict[str, Numbers]]:
     """What ``horizon.c`` and ``shooting.c`` are to know: functions of the model, constants and arrays."""
     kernel, problem, options = shooting.kernel, shooting.problem, shooting.options
-    model, functions = kernel.model, kernel.functions
+    model = kernel.model
     commands = np.array([model.position("u", path) for path in problem.commands], dtype=np.int32)
     outputs = np.array([model.position("y", path) for path in shooting.condensed.outputs()], dtype=np.int32)
     converge = options.mode == "converged"
@@ -138,6 +138,9 @@ def planning(shooting: Shooting) -> tuple[list[ca.Function], dict[str, object], 
         "OTHERS": np.array(others, dtype=np.int32),
     }
     sensitivities = write_sensitivities(kernel, commands, outputs, columns)
-    assert functions.newton is not None
-    loops = [functions.newton, functions.history, functions.update, functions.outputs, *sensitivities]
-    return loops, kernel.constants() | constants | horizon_constants, arrays | horizon_arrays
+    constants["n_sense_hoisted"] = sensitivities[0].numel_out(0)
+    return (
+        [*kernel.stepping(), kernel.functions.land, *sensitivities],
+        kernel.constants() | constants | horizon_constants,
+        arrays | horizon_arrays,
+    )
