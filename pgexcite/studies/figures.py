@@ -52,7 +52,12 @@ def save(drawn: Any, path: Path) -> Path:
 
 
 def draw_runs(
-    runs: Mapping[str, Trace], units: Sequence[str], path: Path, title: str, window: tuple[float, float] | None = None
+    runs: Mapping[str, Trace],
+    units: Sequence[str],
+    path: Path,
+    title: str,
+    window: tuple[float, float] | None = None,
+    signals: Sequence[str] = tuple(signal for signal, _, _ in PANELS),
 ) -> Path:
     """Overlay runs: field voltage, terminal voltage, rotor angle and speed below one another, events marked.
 
@@ -62,8 +67,10 @@ def draw_runs(
         path: of the PNG.
         title: above it.
         window: times to show, s; all of them, where left out.
+        signals: which of ``PANELS`` to draw.
     """
-    shown = [p for p in PANELS if any(f"unit.{u}.{p[0]}" in trace.columns for trace in runs.values() for u in units)]
+    panels = [panel for panel in PANELS if panel[0] in signals]
+    shown = [p for p in panels if any(f"unit.{u}.{p[0]}" in trace.columns for trace in runs.values() for u in units)]
     drawn, axes = figure(8.6, 1.0 + 2.05 * len(shown), len(shown))
     dashes = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
     for ax, (signal, _, axis_label) in zip(axes, shown, strict=True):

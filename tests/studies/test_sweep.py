@@ -95,3 +95,20 @@ def test_a_dying_worker_costs_one_case(study_file, tmp_path, monkeypatch):
     assert errors == [("st1a", "longer line")]
     assert "died" in json.dumps(found.rows)
     assert sum(row.get("outcome") == "completed" for row in found.rows) == 5
+
+
+def test_critical_clearing_times_are_found_where_wanted(study_file, tmp_path):
+    text = study_file.read_text().replace(
+        "[variant.constant]",
+        """[clearing]
+tolerance = 0.02
+set = ["simulation.h=0.02"]
+
+[variant.constant]""",
+    )
+    study_file.write_text(text)
+    with ThreadPoolExecutor(1) as pool:
+        found = sweep.run_study(study_file, tmp_path / "out", executor=pool)
+    times = {(row["variant"], row["factor"]): row["t_crit"] for row in found.rows}
+    assert times["constant", "nominal"] == pytest.approx(0.281, abs=0.02)
+    assert times["constant", "longer line"] < times["constant", "nominal"]

@@ -26,6 +26,7 @@ from pgexcite.plugins.controllers.mpc import MPC
 from pgexcite.plugins.mpc_backends.equivalent import EquivalentMPC
 from pgexcite.plugins.mpc_backends.nmpc import NMPC
 from pgexcite.plugins.transfers.field import FieldTransfer
+from pgexcite.studies.measures import swing_figures
 
 H = 0.005
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -320,6 +321,22 @@ def test_where_nothing_fits_any_more_the_classical_controller_takes_over():
     assert "hands over to the classical controller: the state is not known" in log[2]
     assert trace["controller.mpc.level"][-1] == 2
     assert abs(trace["unit.G2.v_t"][-1] - 1.01) < 0.01  # measured 0.001: the regulator holds it
+
+
+# Weights that damp.
+
+
+@pytest.mark.parametrize(
+    ("line", "least"),
+    [(0.15, 0.15), (0.42, 0.10)],  # measured 0.187 and 0.117, static exciter and stabiliser 0.139 and 0.092
+)
+def test_with_weights_that_damp_the_swing_dies_away_sooner_than_under_the_stabiliser(line, least):
+    path = CONFIGS / "smib" / "fault_equivalent_damped.toml"
+    exact = ["controller.mpc.measurement.noise=0.0", "controller.mpc.measurement.noise_omega=0.0"]
+    scenario = load(path, ["simulation.t_end=6", f"line.L1.X={line}", *exact])
+    sim = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    assert sim.run().ending.value == "completed"
+    assert swing_figures(sim.trace(), "G2")["damping"] > least
 
 
 # Open circuit.
