@@ -24,6 +24,7 @@ PANELS = (
     ("omega", "ω", r"$\omega$ [pu]"),
 )
 """Signals of a comparison from top to bottom: signal, name in a legend of several units, label of the axis."""
+SIGNALS = tuple(panel[0] for panel in PANELS)
 
 
 def figure(width: float, height: float, rows: int = 1) -> tuple[Any, Any]:
@@ -57,7 +58,7 @@ def draw_runs(
     path: Path,
     title: str,
     window: tuple[float, float] | None = None,
-    signals: Sequence[str] = tuple(signal for signal, _, _ in PANELS),
+    signals: Sequence[str] = SIGNALS,
 ) -> Path:
     """Overlay runs: field voltage, terminal voltage, rotor angle and speed below one another, events marked.
 
