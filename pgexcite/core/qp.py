@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 _EPS = 1e-10
 _GAP = 1e-8
-_EPS_INFEASIBLE = 1e-12
+_EPS_INFEASIBLE = 1e-30
 WIDE = 1e20
 _MAX_ITERATIONS = 60
 _MAX_INNER_ITERATIONS = 60
@@ -72,7 +72,7 @@ class QuadraticProgram:
         # Without the gap a point 4e-7 off an active bound counts as solved.
         settings.check_duality_gap, settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = True, _GAP, 0.0
         # A move bound and a box on the same command are parallel rows, and opposite multipliers of theirs look like a certificate
-        # of infeasibility to its own tolerance of 1e-4. What has no solution ends at the caps.
+        # of infeasibility, to its own tolerance of 1e-4 and now and then to 1e-12. What has no solution ends at the caps.
         settings.eps_primal_inf = settings.eps_dual_inf = _EPS_INFEASIBLE
         settings.max_iter, settings.max_iter_in = _MAX_ITERATIONS, _MAX_INNER_ITERATIONS
         settings.initial_guess = proxsuite.proxqp.InitialGuess.WARM_START
@@ -111,16 +111,25 @@ class QuadraticProgram:
         self._low[m:], self._high[m:] = lower, upper
         # Bounds that do not exist are large numbers to ProxQP, not infinities.
         low, high = np.maximum(self._low, -WIDE), np.minimum(self._high, WIDE)
-        self._qp.init(H, g, None, None, self._rows, low, high)
-        self._qp.solve(np.zeros(n), self._no_equality, self._multipliers)
-        results = self._qp.results
-        x, z = np.array(results.x), np.array(results.z)
-        solved = results.info.status == proxsuite.proxqp.QPSolverOutput.PROXQP_SOLVED and bool(np.isfinite(x).all())
+        solved, x, z, iterations = self._run(H, g, low, high, self._multipliers)
+        if not solved and self._multipliers.any():
+            # Multipliers of a program that was too different lead it astray now and then.
+            solved, x, z, more = self._run(H, g, low, high, np.zeros(m + n))
+            iterations += more
         if solved:
             x, z = polished(H, g, lower, upper, rows, rows_lower, rows_upper, x, z)
         self._multipliers = z if solved else np.zeros(m + n)
         # The tolerance leaves a bound crossed by up to eps; what reaches a plant must not be.
-        return QPSolution(np.clip(x, lower, upper), z, solved, int(results.info.iter))
+        return QPSolution(np.clip(x, lower, upper), z, solved, iterations)
+
+    def _run(self, H: Array, g: Array, low: Array, high: Array, start: Array) -> tuple[bool, Array, Array, int]:
+        """ProxQP from these multipliers: whether it has solved it, minimiser, multipliers, iterations."""
+        self._qp.init(H, g, None, None, self._rows, low, high)
+        self._qp.solve(np.zeros(self._n), self._no_equality, start)
+        results = self._qp.results
+        x, z = np.array(results.x), np.array(results.z)
+        solved = results.info.status == proxsuite.proxqp.QPSolverOutput.PROXQP_SOLVED and bool(np.isfinite(x).all())
+        return solved, x, z, int(results.info.iter)
 
 
 def exchange(H: Array, g: Array, lower: Array, upper: Array, multipliers: Array) -> QPSolution | None:

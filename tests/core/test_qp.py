@@ -43,6 +43,22 @@ def test_random_programs_agree_with_an_active_set_solver(seed, named):
         assert found.x == pytest.approx(wanted, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    "seed", [273, *range(20)]
+)  # 273: infeasible to a tolerance of 1e-12, when it starts from the one before
+def test_multipliers_of_an_unlike_program_do_not_lead_astray(seed):
+    draw = np.random.default_rng(seed)
+    n = int(draw.integers(1, 9))
+    program, rows = QuadraticProgram(n, n), np.eye(n) - np.eye(n, k=-1)
+    for _ in range(8):
+        root = draw.normal(size=(n, n))
+        hessian = root @ root.T * 10 ** draw.uniform(-3, 2) + 0.02 * np.eye(n)
+        gradient = 10 ** draw.uniform(-1, 2) * draw.normal(size=n)
+        lower = -draw.uniform(0, 3, n) * (draw.random(n) < 0.8)
+        upper, reach = draw.uniform(0, 3, n) * (draw.random(n) < 0.8), draw.uniform(0.01, 1, n)
+        assert program.solve(hessian, gradient, lower, upper, rows, -reach, reach).solved
+
+
 def test_a_contradiction_is_not_solved():
     program = QuadraticProgram(2, 1)
     low, high = np.full(2, -1.0), np.ones(2)
