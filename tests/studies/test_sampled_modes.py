@@ -74,6 +74,7 @@ class _Integral:
     information: str = "measured"
     measurement: Measurement = field(default_factory=Measurement)
     active: bool = True
+    disturbance_known: bool = False
 
     def measures(self):
         return ("unit.G2.v_t",)
