@@ -200,6 +200,11 @@ class Simulation:
         return {name: running.session for name, running in self._running.items()}
 
     @property
+    def instruments(self) -> Mapping[str, Instruments]:
+        """What the controllers measure with, by name."""
+        return {name: running.instruments for name, running in self._running.items()}
+
+    @property
     def sampling(self) -> int:
         """Steps between two instants at which a controller may be due; 0 without controllers."""
         return math.gcd(*(r.every for r in self._running.values()))

@@ -29,6 +29,8 @@ CARRIED = ("u", "solver:u", "solver:filter:x")
 
 The rest stays as it is at rest. A filter's covariance does not depend on what is measured, and while it does not the innovations
 are zero: its gain has no first-order effect. A quadratic program's solution does not depend on the plan it starts from."""
+_UNDER_WAY = "instruments"
+"""Name given to the delayed samples of a controller's measurements, which carry the past on as well."""
 _FORGOTTEN = 1e-6
 """Multipliers below this are gone after a sample; their logarithm says nothing."""
 
@@ -39,7 +41,8 @@ class SampledLoop:
 
     Attributes:
         A: the map, shape ``(n, n)``.
-        names: of what it maps: paths of the plant's states, ``controller.<name>.<memory>.<k>`` of the controllers'.
+        names: of what it maps: paths of the plant's states, ``controller.<name>.<memory>.<k>`` of the controllers',
+            ``controller.<name>.instruments.<k>`` of measurements that are delayed.
         period: length of the sample, s.
         defect: largest change over a sample of what should be at rest.
     """
@@ -81,7 +84,8 @@ def sampled_modes(
         size: by how much each state is moved either way, in its unit. A controller's tolerances must be well below what it answers.
 
     Raises:
-        PgexciteError: the simulation is not at a sampling instant, is not at rest, or does not get over the sample.
+        PgexciteError: the simulation is not at a sampling instant, is not at rest, or does not get over the sample; delayed
+            measurements have not yet been taken.
     """
     loop = _Loop(simulation, period, carried)
     rest = loop.read()
@@ -110,16 +114,27 @@ class _Loop:
         model = simulation.model
         moving = linearise(model, self._start, simulation.p).x_names
         self._moving = np.array([model.position("x", path) for path in moving], dtype=int)
-        self._memory = {name: dict(session.memory()) for name, session in simulation.sessions.items()}
+        self._memory = self._kept()
+        carried = (*carried, _UNDER_WAY)
         self._entries = [(name, key) for name, kept in self._memory.items() for key in carried if key in kept]
         own = [
             f"controller.{name}.{key}.{k}" for name, key in self._entries for k in range(self._memory[name][key].size)
         ]
         self.names = (*moving, *own)
 
+    def _kept(self) -> dict[str, dict[str, Array]]:
+        """What each controller and its instruments remember now."""
+        instruments = self._sim.instruments
+        return {
+            name: {**session.memory(), _UNDER_WAY: instruments[name].memory()}
+            for name, session in self._sim.sessions.items()
+        }
+
     def read(self) -> Array:
         """What the simulation carries on now."""
-        kept = {name: session.memory() for name, session in self._sim.sessions.items()}
+        kept = self._kept()
+        if any(kept[name][_UNDER_WAY].shape != self._memory[name][_UNDER_WAY].shape for name in kept):
+            raise PgexciteError("delayed measurements have not yet been taken: run the simulation for a sample or more")
         return np.concatenate(
             (self._sim.state.x[self._moving], *(np.ravel(kept[name][key]) for name, key in self._entries))
         )
@@ -131,6 +146,8 @@ class _Loop:
         settled = self._sim.kernel.settle(self._start.with_(x=x), self._sim.p)
         if settled is None:
             raise PgexciteError("the network has no solution next to this point")
+        # Solving the network again is not a discontinuity that the loop would have met.
+        settled = settled.with_(startup=self._start.startup)
         memory = {name: dict(kept) for name, kept in self._memory.items()}
         at = self._moving.size
         for name, key in self._entries:
@@ -151,4 +168,6 @@ class _Loop:
     def _place(self, state: State, memory: Mapping[str, Mapping[str, Array]]) -> None:
         self._sim.state = state
         for name, session in self._sim.sessions.items():
-            session.recall(memory[name])
+            kept = dict(memory[name])
+            self._sim.instruments[name].recall(kept.pop(_UNDER_WAY))
+            session.recall(kept)

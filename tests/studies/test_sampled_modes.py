@@ -53,6 +53,12 @@ def test_without_control_it_is_the_rule_of_the_steps(system):
     assert distance(found, [swing]) < 2e-3  # measured 6e-4, 4e-4
 
 
+def test_the_trapezoidal_rule_has_no_step_of_another_rule_in_it():
+    sim = Simulation(kobbelv(), Settings(6.0, H, "trapezoidal", "never"))
+    half = linearised(sim).eigenvalues() * H / 2
+    assert distance(sampled_modes(sim, 0.1).multipliers, ((1 + half) / (1 - half)) ** 20) < 1e-7  # measured 9e-10
+
+
 def test_it_tends_to_the_modes_of_continuous_time_with_the_step():
     errors = []
     for h in (0.01, 0.005, 0.0025):
@@ -101,10 +107,8 @@ class _Integrating:
         self.u, self.v_ref = float(memory["u"]), float(memory["v_ref"])
 
 
-def test_a_sampled_controller_in_closed_form():
-    """``u+ = u - k C x``, ``x+ = Phi x + Gamma u+``, with ``Phi`` and ``Gamma`` of TR-BDF2's steps."""
-    gain = 2.0
-    sim = simulation(integral=_Integral(gain))
+def over_a_sample(sim):
+    """``x+ = Phi x + Gamma u`` by TR-BDF2's steps, and ``v_t = C x``."""
     at = linearised(sim)
     command, voltage = at.u_names.index("unit.G2.exciter.e_fd_ref"), at.y_names.index("unit.G2.v_t")
     n = len(at.x_names)
@@ -113,14 +117,35 @@ def test_a_sampled_controller_in_closed_form():
     half = np.linalg.inv(np.eye(n + 1) - GAMMA * H / 2 * whole)
     step = half @ (ALPHA * half @ (np.eye(n + 1) + GAMMA * H / 2 * whole) - BETA * np.eye(n + 1))
     over = np.linalg.matrix_power(step, 20)
-    Phi, Gamma = over[:n, :n], over[:n, n:]
-    C, D = at.C[voltage : voltage + 1], at.D[voltage, command]
-    assert D == 0
+    assert at.D[voltage, command] == 0
+    return over[:n, :n], over[:n, n:], at.C[voltage : voltage + 1]
+
+
+def test_a_sampled_controller_in_closed_form():
+    """``u+ = u - k C x``, ``x+ = Phi x + Gamma u+``."""
+    gain = 2.0
+    sim = simulation(integral=_Integral(gain))
+    Phi, Gamma, C = over_a_sample(sim)
     closed = np.block([[Phi - gain * Gamma @ C, Gamma], [-gain * C, np.ones((1, 1))]])
     loop = sampled_modes(sim, 0.1)
     assert loop.names[-1] == "controller.integral.u.0"
     assert distance(loop.multipliers, np.linalg.eigvals(closed)) < 1e-7  # measured 1.2e-9
     assert loop.defect < 1e-9  # measured 7e-14
+
+
+def test_a_delayed_measurement_in_closed_form():
+    """``m+ = C x``, ``u+ = u - k m``, ``x+ = Phi x + Gamma u+``: the delay is a state."""
+    gain = 2.0
+    sim = simulation(integral=_Integral(gain, measurement=Measurement(delay=1)))
+    with pytest.raises(PgexciteError, match="not yet been taken"):
+        sampled_modes(sim, 0.1)
+    sim.run(until=0.1)
+    Phi, Gamma, C = over_a_sample(sim)
+    none, one = np.zeros_like(C), np.ones((1, 1))
+    closed = np.block([[Phi, Gamma, -gain * Gamma], [none, one, -gain * one], [C, 0 * one, 0 * one]])
+    loop = sampled_modes(sim, 0.1)
+    assert loop.names[-1] == "controller.integral.instruments.0"
+    assert distance(loop.multipliers, np.linalg.eigvals(closed)) < 1e-7  # measured 3e-9
 
 
 @pytest.mark.parametrize(("backend", "options"), [("nmpc", {"tolerance": 1e-9}), ("linear", {"relinearise": "once"})])
