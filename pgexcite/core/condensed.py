@@ -82,7 +82,7 @@ class Condensed:
 
     Args:
         problem: the control problem.
-        solver: of programs with ``variables`` variables and ``rows`` rows; ProxQP where left out.
+        solver: of programs with ``variables`` variables and ``rows`` rows; ``QuadraticProgram`` where left out.
     """
 
     def __init__(self, problem: Problem, solver: QPSolver | None = None) -> None:

@@ -1,10 +1,11 @@
-"""Small dense quadratic programs by ProxQP, with its iteration caps set so that it cannot stall a control loop.
+"""Small dense quadratic programs: by pivoting where there is only a box, by ProxQP else, capped so that no control loop stalls.
 
 ProxQP's default limits let a contradictory problem of ten variables run for half a minute. Inputs are therefore checked first and
 the caps are the deadline.
 
 A program with nothing but a box is first tried with the bounds that were active last. Where that set, or one a few exchanges away,
-satisfies the optimality conditions, the program is solved, exactly and in a tenth of the time; else ProxQP solves it.
+satisfies the optimality conditions, the program is solved, exactly and in a tenth of the time; else ProxQP solves it. What ProxQP
+finds is made exact by ``pgexcite.core.polish``.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class Shooting(ABC):
         rule: integration rule of the prediction.
         h: prediction step in the first interval, s.
         grid: the plant's step, s.
-        qp: solver of the programs; ProxQP where left out.
+        qp: solver of the programs; ``QuadraticProgram`` where left out.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Nonlinear MPC on the perfect model: Gauss-Newton on the plant's own step, condensed to the moves, ProxQP for each subproblem.
+"""Nonlinear MPC on the perfect model: Gauss-Newton on the plant's own step, condensed to the moves, one QP each.
 
 Single shooting (the rollout eliminates the states) and the real-time iteration: M. Diehl, H. J. Ferreau, N. Haverbeke, "Efficient
 numerical methods for nonlinear MPC and moving horizon estimation" (2009), sections 4 and 5, with the exact sensitivities of the
