@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import exported
@@ -108,6 +109,17 @@ def test_it_stands_alone_and_allocates_nothing(tmp_path):
     offered, wanted = exported.symbols(tmp_path)
     assert offered == {"mpc_reset", "mpc_step", "mpc_prepare"}
     assert wanted == set()
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize("name", ["ladder", "one", "2nd", "G 2"])
+def test_a_name_that_c_has_otherwise_is_made_another(name, tmp_path):
+    """``ladder_reset`` and ``one_step`` are functions of the controller's own."""
+    case = load(NMPC, ["simulation.t_end=1"])
+    found = export_c(replace(case, controllers={name: case.controllers["mpc"]}), tmp_path)
+    code, figures = exported.replay(tmp_path, found.name)
+    assert code == 0
+    assert figures["samples"] == 20
 
 
 @pytest.mark.compiler

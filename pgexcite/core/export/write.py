@@ -19,6 +19,10 @@ from pgexcite.core.ladder import Ladder
 from pgexcite.core.simulate import Simulation
 
 
+_SHARED = ("dense.c", "qp.c", "condensed.c", "ladder.c")
+"""What goes above the parts of every solver."""
+
+
 class ExportError(PgexciteError):
     """A controller cannot be written as C."""
 
@@ -29,7 +33,7 @@ class Exported:
 
     Attributes:
         directory: where.
-        name: prefix of files, functions and types.
+        name: prefix of files, functions and types: the controller's, with ``controller_`` before it where C would not have that.
         samples: length of the recorded closed loop.
     """
 
@@ -57,7 +61,7 @@ def export_c(scenario: Scenario, directory: Path, controller: str = "") -> Expor
         raise ConfigError([Problem(f"controller.{name}", "cannot be exported: its backend offers no C")])
     measured = scenario.controllers[name].measures()
     parts = session.solver.parts(f"controller.{name}", measured)
-    prefix = re.sub(r"\W", "_", name)
+    prefix = _prefix(name, parts)
     files = _files(prefix, scenario, session, parts, len(measured))
     _ensure_ours(directory, [*files, "replay.txt"])
     recorder = Recorder(session, parts)
@@ -77,6 +81,14 @@ def _chosen(scenario: Scenario, controller: str) -> str:
         return names[0]
     what = f"there is no controller {controller!r}" if controller else "which of the controllers is to be exported?"
     raise ConfigError([Problem("controller", what, hint=f"there are: {', '.join(names) or 'none'}")])
+
+
+def _prefix(name: str, parts: Parts) -> str:
+    """The controller's name as C can have it: of an identifier, and of no function or type that is there already."""
+    prefix = re.sub(r"\W", "_", name, flags=re.ASCII)
+    texts = [*(loop(file) for file in (*_SHARED, *parts.loops, "replay.c")), *parts.templates]
+    taken = re.compile(rf"\b{prefix}_(reset|step|prepare|input|output)\b")
+    return f"controller_{prefix}" if prefix[0].isdigit() or any(map(taken.search, texts)) else prefix
 
 
 def _ensure_ours(directory: Path, files: Sequence[str]) -> None:
@@ -107,8 +119,7 @@ def _files(name: str, scenario: Scenario, session: Ladder, parts: Parts, measure
     def filled(template: str) -> str:
         return Template(template).substitute(words)
 
-    shared_loops = [loop(file) for file in ("dense.c", "qp.c", "condensed.c", "ladder.c")]
-    below = [filled(template) for template in (*shared_loops, *parts.templates)]
+    below = [filled(template) for template in (*map(loop, _SHARED), *parts.templates)]
     return {
         f"{name}.h": filled(loop("controller.h")),
         f"{name}.c": "\n".join([f'#include "{name}.h"\n', _model(session, parts, measured), *below]),

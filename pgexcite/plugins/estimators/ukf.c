@@ -381,7 +381,7 @@ static void ukf_tell(int change, double surprise) {
             of_delta += around[i] * P[(1 + i) * 3 + 1 + k] * around[k];
         }
     memcpy(estimator_value, ukf_x, sizeof ukf_x);
-    /* In the order of UKF.told. */
+    /* In the order of _TOLD in ukf.py. */
     estimator_told[0] = ukf_x[UKF_X_S];
     estimator_told[1] = sqrt(ukf_larger(P[0], 0));
     estimator_told[2] = v_bus;
