@@ -468,7 +468,7 @@ class Simulation:
             memory[f"instruments:{name}"] = r.instruments.memory()
             memory[f"active:{name}"] = np.array(float(r.active))
         memory["low"] = self._low.elapsed
-        memory |= {"triggers:elapsed": self._triggers.elapsed, "triggers:fired": self._triggers.fired}
+        memory |= {f"trigger:{key}": value for key, value in self._triggers.memory().items()}
         here = sum(self._boundary(change) == self.state.k for change in self._changes)
         memory["applied_here"] = np.array(
             here - sum(self._boundary(change) == self.state.k for change in self._pending)
@@ -491,7 +491,8 @@ class Simulation:
             running.session.recall(own)
             running.instruments.recall(memory[f"instruments:{name}"])
             running.active = bool(memory[f"active:{name}"] > 0)
-        self._triggers.elapsed, self._triggers.fired = memory["triggers:elapsed"], memory["triggers:fired"]
+        start = "trigger:"
+        self._triggers.recall({k.removeprefix(start): v for k, v in memory.items() if k.startswith(start)})
         self._changes = _in_order([*self._changes, *self._triggers.past()])
         here = [change for change in self._changes if self._boundary(change) == self.state.k]
         later = [change for change in self._changes if self._boundary(change) > self.state.k]

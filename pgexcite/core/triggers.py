@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -65,6 +65,16 @@ class Triggers:
             for change in self._timed([when], t)
             if not np.isnan(t)
         ]
+
+    def memory(self) -> dict[str, Array]:
+        """``elapsed`` and ``fired`` of each condition, under what it says."""
+        both = np.column_stack((self.elapsed, self.fired))
+        return {repr(when): row for when, row in zip(self._conditions, both, strict=True)}
+
+    def recall(self, memory: Mapping[str, Array]) -> None:
+        """Take up where ``memory`` left off; a condition that is not in it has never held."""
+        for k, when in enumerate(self._conditions):
+            self.elapsed[k], self.fired[k] = memory.get(repr(when), (-1.0, np.nan))
 
     def _held(self, t: Array, y: Array) -> Array:
         """For how long each condition has held at each sample, s; negative where it does not."""

@@ -129,6 +129,21 @@ def test_a_resumed_run_goes_on_the_same(pause, tmp_path):
     assert moved_at(whole) == pytest.approx([0.655])  # first seen at 0.505
 
 
+def test_a_resumed_run_may_wait_for_other_conditions(tmp_path):
+    """What came true stays so under its own condition; one that is new has never held."""
+    one, other = raised(below=0.9), raised(value=1.8, above=0.9, after=0.65, lasting=0.05)
+    before = simulation(FAULT, one)
+    before.run(until=0.58)
+    before.save(tmp_path / "at.npz")
+    resumed = simulation(FAULT, other, one)
+    resumed.resume(tmp_path / "at.npz")
+    whole = simulation(FAULT, one, other)
+    for run in (resumed, whole):
+        run.run()
+    assert moved_at(whole).size == 2
+    assert moved_at(resumed) == pytest.approx(moved_at(whole)[-1:])
+
+
 def test_a_restart_forgets_what_came_true():
     sim = simulation(FAULT, raised(below=0.9))
     sim.run()
