@@ -18,7 +18,6 @@ from pgexcite.core.export.recorder import Recorder
 from pgexcite.core.ladder import Ladder
 from pgexcite.core.simulate import Simulation
 
-
 _SHARED = ("dense.c", "qp.c", "condensed.c", "ladder.c")
 """What goes above the parts of every solver."""
 
