@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 _UNLOADING, _PIECES = 5.0, 5
 """Time between the steps by which the load goes to its least share, s, and how many they are."""
 
+_ROUNDING = 1e-6
+"""Of a number of steps."""
+
 
 @dataclass(frozen=True)
 class Pace:
@@ -86,7 +89,7 @@ def pv_by_ramp(
         increments = {path: power * share for path, power in demand.items()}
         return Change(t, {}, f"load {load} changes by {share:+.3g} of its demand", increments)
 
-    count = int(np.log(pace.heavy / pace.light) / np.log(pace.growth))
+    count = int(np.log(pace.heavy / pace.light) / np.log(pace.growth) + _ROUNDING)
     shares = pace.light * pace.growth ** np.arange(count + 1)
     steps = [step(_UNLOADING * k, (pace.light - 1.0) / _PIECES) for k in range(_PIECES)]
     steps += [step(pace.begins + pace.every * k, float(share)) for k, share in enumerate(np.diff(shares))]
@@ -96,7 +99,8 @@ def pv_by_ramp(
         sorted([*changes, *steps], key=lambda change: change.t),
     )
     outcome, trace = simulation.run(), simulation.trace()
-    ends = np.searchsorted(trace.t, np.arange(pace.begins, outcome.t, pace.every) - 1e-6) - 1
+    whole = int(np.floor((outcome.t - pace.begins) / pace.every + _ROUNDING))
+    ends = np.searchsorted(trace.t, pace.begins + pace.every * np.arange(whole + 1) - 1e-6) - 1
     P, V = system.S_base * trace[f"load.{load}.p"], trace[f"bus.{device.bus}.v"]
     return Ramp(P[ends], V[ends], _acted(trace, P, V), str(outcome))
 

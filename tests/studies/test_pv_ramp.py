@@ -40,6 +40,13 @@ def test_without_dynamics_it_is_the_closed_form_on_both_branches(tan_phi):
     assert found.acted == {}
 
 
+def test_every_step_has_its_point_the_last_one_too():
+    """Three steps of ten: the quotient of the logarithms is 2.9999999999999996."""
+    scenario = two_bus("load.L.Q=0.0")
+    found = pv_by_ramp(scenario.system, scenario.settings, "L", pace=Pace(1.0, 1000.0, 10.0, 0.2, 30.0))
+    assert pytest.approx([10.0, 100.0, 1e3, 1e4], rel=1e-9) == found.P / found.V**2
+
+
 def test_changes_before_the_ramp_act_on_it():
     """The second of two lines trips: half the power."""
     scenario = two_bus()
