@@ -77,15 +77,6 @@ Rows = dict[int, dict[int, Entry]]
 """A sparse system: for each unknown the row it is eliminated with, as coefficients by unknown."""
 
 
-def matrix_rows(matrix: ca.SX, pairing: NDArray[np.intp]) -> Rows:
-    """A matrix as a system, all of it computed in every iteration and known at no point."""
-    unknown_of = {int(row): column for column, row in enumerate(pairing)}
-    rows: Rows = {k: {} for k in range(matrix.shape[0])}
-    for i, j, value in zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True):
-        rows[unknown_of[i]][j] = Entry(value, True, np.zeros(0))
-    return rows
-
-
 def _product(a: Entry, b: Entry) -> Entry:
     return Entry(a.value * b.value, a.online or b.online, a.samples * b.samples)
 

@@ -13,7 +13,7 @@ from plants import regulated, two_units
 
 from pgexcite.core.errors import AssemblyError
 from pgexcite.core.initialise import initialise
-from pgexcite.core.linear_algebra import SymbolicLU, matrix_rows, pair_equations
+from pgexcite.core.linear_algebra import Entry, SymbolicLU, pair_equations
 from pgexcite.core.stage import build_stage_functions, write_stage
 
 
@@ -23,6 +23,15 @@ def symbolic(pattern):
     sparsity = ca.Sparsity.triplet(*pattern.shape, rows.tolist(), cols.tolist())
     entries = ca.SX.sym("a", sparsity.nnz())
     return ca.SX(sparsity, entries), entries
+
+
+def matrix_rows(matrix, pairing):
+    """A matrix as a system, all of it computed in every iteration and known at no point."""
+    unknown_of = {int(row): column for column, row in enumerate(pairing)}
+    rows = {k: {} for k in range(matrix.shape[0])}
+    for i, j, value in zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True):
+        rows[unknown_of[i]][j] = Entry(value, True, np.zeros(0))
+    return rows
 
 
 def solved(A, B, pairing):
