@@ -32,6 +32,30 @@ def test_the_clearing_time_does_not_depend_on_step_or_rule(rule):
     assert fine.t_crit == pytest.approx(0.28095, abs=5e-5)  # measured 0.280955 by both rules
 
 
+FROM_THE_TERMINALS = ("unit.G2.transfer.ceiling=rectifier", "controller.mpc.u_max=3.85")
+ON_ITS_OWN_SUPPLY = (
+    "unit.G2.exciter={model='sexs', T_R=0.02, K=200.0, T_A=6.5, T_B=22.0, T_E=0.0, E_MIN=-3.2, E_MAX=3.2}",
+)
+WITHOUT_GAIN_REDUCTION = ("unit.G2.exciter.T_C=0.0", "unit.G2.exciter.T_B=0.0")
+EXACT = ("controller.mpc.measurement.noise=0.0", "controller.mpc.measurement.noise_omega=0.0")
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "t_crit"),
+    [
+        ("fault_st1a", (), 0.2769),
+        ("fault_st1a", WITHOUT_GAIN_REDUCTION, 0.2769),
+        ("fault_st1a", ON_ITS_OWN_SUPPLY, 0.2884),
+        pytest.param("fault_nmpc", (), 0.2884, marks=pytest.mark.slow),
+        pytest.param("fault_linear", FROM_THE_TERMINALS, 0.2769, marks=pytest.mark.slow),
+        pytest.param("fault_equivalent", (*FROM_THE_TERMINALS, *EXACT), 0.2769, marks=pytest.mark.slow),
+    ],
+)
+def test_the_clearing_time_is_that_of_the_fields_supply_whoever_commands_it(name, overrides, t_crit):
+    found = critical_clearing_time(load(SMIB / f"{name}.toml", ["simulation.t_end=4.0", *overrides]), 5e-4)
+    assert found.t_crit == pytest.approx(t_crit, abs=5e-4)  # measured 0.27685 and 0.28835 to 1e-4, each of them
+
+
 def test_a_fault_that_never_clears_is_searched_all_the_same():
     scenario = load(SMIB / "clearing_arc.toml", ['event=[{type="fault", t=1.0, bus="HV", R=0.02}]'])
     assert critical_clearing_time(scenario, 1e-3).t_crit == pytest.approx(0.281, abs=1e-3)

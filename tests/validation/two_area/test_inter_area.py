@@ -193,6 +193,34 @@ def test_who_keeps_synchronism(case):
     assert max(trace[f"unit.G{k}.e_fd"].max() for k in UNITS) <= 4.0 + 1e-9
 
 
+FROM_THE_TERMINALS = tuple(f"unit.G{k}.transfer.ceiling='rectifier'" for k in UNITS)
+INDEPENDENT = tuple(
+    f"unit.G{k}.exciter={{model='sexs', T_R=0.01, K=200.0, T_A=0.0, T_B=0.0, T_E=0.0, E_MIN=-4.0, E_MAX=4.0}}"
+    for k in UNITS
+)
+WIDE = tuple(f"unit.G{k}.stabiliser.{limit}" for k in UNITS for limit in ("V_SMAX=0.2", "V_SMIN=-0.2"))
+OTHER_SUPPLY = {
+    "stabilisers": ("fault_thyristor_pss", INDEPENDENT, None),
+    "stabilisers with wide limits, from the terminals": ("fault_thyristor_pss", WIDE, 2.56),
+    "nmpc": ("fault_nmpc", FROM_THE_TERMINALS, 2.54),
+    "nmpc, one move": ("fault_nmpc", (*FROM_THE_TERMINALS, *ONE_MOVE), 2.85),
+    "secondary": ("fault_linear_secondary", INDEPENDENT, None),
+    "secondary, one move": ("fault_linear_secondary", (*INDEPENDENT, *ONE_MOVE), 4.44),
+    "linear": ("fault_linear", FROM_THE_TERMINALS, 6.79),
+    "linear that is told the event": ("fault_linear", (*FROM_THE_TERMINALS, *KNOWN), None),
+}
+"""The fault with the fields fed the other way: when synchronism is lost, s, or ``None``."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", OTHER_SUPPLY)
+def test_the_supply_of_the_fields_decides_who_keeps_the_fault(case):
+    name, overrides, lost = OTHER_SUPPLY[case]
+    sim, ending = run(name, *overrides)
+    assert ending == ("completed" if lost is None else "lost_synchronism")
+    assert lost is None or sim.outcome.t == pytest.approx(lost, abs=0.05)
+
+
 FAULT_ALONE = ("event=[{type='fault', t=0.5, bus='7', duration=0.1}]",)
 WITHOUT_TRIP = {
     "stabilisers": ("fault_thyristor_pss", (), 0.136),
