@@ -115,7 +115,7 @@ def test_example_13_1_largest_angle(clearing, h):
     trace = sim.trace()
     peak = int(np.argmax(trace["unit.G.delta"]))
     expected = figures["recomputed"]["delta_max_deg"][clearing]
-    assert np.degrees(trace["unit.G.delta"][peak]) == pytest.approx(expected, abs=0.1)  # measured 1e-4, 2e-4
+    assert np.degrees(trace["unit.G.delta"][peak]) == pytest.approx(expected, abs=2e-3)  # measured 1e-4, 2e-4
     if clearing == "0.07":
         assert trace.t[peak] - 0.1 == pytest.approx(
             figures["recomputed"]["t_max_0.07"], abs=1e-3

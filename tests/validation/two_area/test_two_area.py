@@ -45,10 +45,10 @@ def electromechanical(found):
 def test_power_flow():
     flow = initial("manual").flow
     for bus, (V, angle) in DYNAWO.items():
-        assert np.degrees(np.angle(flow.v[bus])) == pytest.approx(angle, abs=0.1)  # measured 5e-4 deg
+        assert np.degrees(np.angle(flow.v[bus])) == pytest.approx(angle, abs=2e-3)  # printed to 1e-3 deg; measured 5e-4
         assert abs(flow.v[bus]) == pytest.approx(V, abs=1e-3)  # printed to three decimals; measured 5e-4
     for unit, s in DYNAWO_UNITS.items():
-        assert abs(flow.s[f"unit.{unit}"] * 100 - s) < 0.5  # measured 1e-3 MVA
+        assert abs(flow.s[f"unit.{unit}"] * 100 - s) < 5e-3  # measured 1e-3 MVA
 
 
 @pytest.mark.parametrize("name", ["manual", "dc", "thyristor", "thyristor_tgr", "thyristor_pss"])
