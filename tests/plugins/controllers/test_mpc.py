@@ -196,7 +196,7 @@ def test_real_time_iteration_costs_little_against_converged_plans():
     """Closed-loop cost over the fault run, one prepared QP a sample against every plan converged."""
     quick, full = run(5.0), run(5.0, options={"mode": "converged", "tolerance": 1e-8, "max_iterations": 100})
     costs = [sim.result().controllers["mpc"].cost for sim in (quick, full)]
-    assert costs[0] == pytest.approx(costs[1], rel=1e-3)  # measured 1.2e-7
+    assert costs[0] == pytest.approx(costs[1], rel=2e-6)  # measured 1.2e-7
     assert quick.trace()["controller.mpc.iterations"].sum() < full.trace()["controller.mpc.iterations"].sum()
 
 
@@ -242,7 +242,7 @@ def test_after_a_jump_a_program_or_two_are_enough(case, count):
         sim.run()
         runs.append(sim)
     costs = [sim.result().controllers["mpc"].cost for sim in runs]
-    assert costs[0] == pytest.approx(costs[1], rel=1e-3)  # measured 2e-5 and 5e-7
+    assert costs[0] == pytest.approx(costs[1], rel=1e-4)  # measured 2e-5 and 5e-7
     off = np.abs(np.diff([sent(sim) for sim in runs], axis=0)).max()
     assert off < {1: 0.05, 2: 1e-3}[count]  # measured 2e-2 and 3e-4 pu, of 4 pu
 

@@ -25,7 +25,7 @@ def test_operating_point_of_the_hydro_unit(plant):
     values = plant[0]
     grid = _AT.v - 1j * _X_E * _AT.i
     assert abs(grid) == pytest.approx(0.893, abs=1e-4)  # measured 8e-6
-    assert math.degrees(values["delta"] - np.angle(grid)) == pytest.approx(39.0, abs=0.01)  # measured 3e-5
+    assert math.degrees(values["delta"] - np.angle(grid)) == pytest.approx(39.0, abs=1e-3)  # measured 3e-5
     assert values["e_fd"] == pytest.approx(1.92460, abs=1e-5)  # measured 2e-6
 
 
