@@ -6,7 +6,8 @@ import pytest
 
 from pgexcite.studies.sweep import NOMINAL, run_study
 
-pytestmark = [pytest.mark.slow, pytest.mark.mismatch]
+# One worker runs the study for all of them.
+pytestmark = [pytest.mark.slow, pytest.mark.mismatch, pytest.mark.xdist_group("mismatch")]
 
 PREDICTIVE = tuple(f"{name}{weights}" for name in ("nmpc", "linear", "equivalent") for weights in ("", "_damped"))
 
