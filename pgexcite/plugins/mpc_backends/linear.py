@@ -26,6 +26,7 @@ from pgexcite.core.export.linear import filtering, predictions
 from pgexcite.core.export.shared import objections
 from pgexcite.core.export.shooting import DELAYED
 from pgexcite.core.horizons import Horizons
+from pgexcite.core.ladder import PLAUSIBLE
 from pgexcite.core.local import LocalModel
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solution, Solver, Status
@@ -38,10 +39,6 @@ Disturbed = Literal["v_t", "p_e", "q_e", "i_fd", "torque"]
 
 _SIGNALS = ("v_t", "omega", "p_e", "q_e", "i_fd")
 """What the filter takes from a unit's terminals; the field voltage is an input of the model."""
-_ABSURD = 1e3
-"""A measurement beyond this, pu, says that an instrument is broken: it is neither believed nor taken for a lost one."""
-
-
 _AGREEMENT = 1e-9
 """Difference from Python of a command of its C, pu."""
 _ABOUT = """One predictive controller for one plant: a linear model of its own, a Kalman filter on states and disturbances that sees
@@ -311,7 +308,8 @@ class _Linear:
                 after = self._horizons.until(sample.t, self._u_0, self._p_0)
                 y, C = self._local.outputs(step.x, u - self._u_bias, *after) or (y, C)
         measured = np.array([sample.measured[path] for path in self._measured])
-        if np.nanmax(np.abs(measured), initial=0.0) > _ABSURD:
+        # An instrument is broken: not believed, and not taken for a lost measurement. (From the ladder it comes as one.)
+        if np.nanmax(np.abs(measured), initial=0.0) > PLAUSIBLE:
             return False
         self.filter.correct(measured, y + self._y_bias, C)
         if not self.filter.sound:
