@@ -43,6 +43,25 @@ def replay(directory: Path, name: str = "mpc") -> tuple[int, dict[str, float]]:
     return done.returncode, {key: float(value) for key, value in figures.items()}
 
 
+def replay_alike(directory: Path, samples: int) -> dict[str, float]:
+    """Figures of a replay in which every answer is Python's, to 1e-9."""
+    code, figures = replay(directory)
+    assert figures["samples"] == samples
+    assert figures["samples on another level"] == 0
+    assert figures["largest difference of a command"] < 1e-9
+    assert figures.get("largest difference of an estimate", 0.0) < 1e-9
+    assert code == 0
+    return figures
+
+
+def stands_alone(directory: Path) -> None:
+    """Three functions are offered; no other than those of the mathematical library are called, none that allocates."""
+    build(directory)
+    offered, wanted = symbols(directory)
+    assert offered == {"mpc_reset", "mpc_step", "mpc_prepare"}
+    assert wanted == set()
+
+
 def symbols(directory: Path, name: str = "mpc") -> tuple[set[str], set[str]]:
     """What the compiled controller offers, and what it wants beyond the mathematical library and block copies."""
     listed = subprocess.run(["nm", f"{name}.o"], cwd=directory, capture_output=True, text=True, check=True).stdout
