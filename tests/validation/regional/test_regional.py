@@ -157,8 +157,11 @@ def test_the_field_voltage_of_one_unit_saves_only_beyond_its_limiters_current():
     outcome, figures = claim("link_loss_nmpc_primary")
     assert outcome.ending.value == "completed"
     assert figures["overload"] > 500
-    bound = 'controller.mpc.soft=[{signal="i_fd",upper=1.95,weight=3000.0}]'
-    assert claim("link_loss_nmpc_primary", bound)[0].ending.value == "voltage_collapse"
+    for upper, t in ((1.95, 225.6), (2.0475, 500.8)):  # the limiter's limit, and its pick-up
+        bound = f'controller.mpc.soft=[{{signal="i_fd",upper={upper},weight=3000.0}}]'
+        outcome = claim("link_loss_nmpc_primary", bound, "simulation.t_end=1200.0")[0]
+        assert outcome.ending.value == "voltage_collapse"
+        assert outcome.t == pytest.approx(t, abs=5.0)
 
 
 MPC = "controller.mpc"

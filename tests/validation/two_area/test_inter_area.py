@@ -70,6 +70,15 @@ def test_stabilisers_damp_as_the_linearised_system_says():
     assert inter_area(sim).eigenvalue == pytest.approx(expected.eigenvalue, abs=5e-4)  # measured 5e-5
 
 
+@pytest.mark.parametrize(("gain", "damping"), [(50.0, 0.351), (80.0, 0.563)])
+def test_stabilisers_of_more_gain_damp_more(gain, damping):
+    """The shipped gain of 20 is Kundur's; no other mode then has less than 0.355."""
+    sim = simulation("thyristor_pss", "event=[]", *(f"unit.G{k}.stabiliser.K_STAB={gain}" for k in UNITS))
+    modes = linearise(sim.model, sim.state, sim.p).modes()
+    assert lightly_damped(modes).damping == pytest.approx(damping, abs=2e-3)
+    assert min(m.damping for m in modes if m.frequency_hz > INTER_AREA[1]) > 0.35
+
+
 MAPS = {
     "nmpc, one move": ("step_nmpc", (*ONE_MOVE, "controller.mpc.options={tolerance=1e-9}"), -0.4091 + 3.1088j),
     "nmpc": ("step_nmpc", ("controller.mpc.options={tolerance=1e-9}",), -2.1897 + 2.2154j),
