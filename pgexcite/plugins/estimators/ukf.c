@@ -288,6 +288,7 @@ static int ukf_propagate(void) {
     memset(Q, 0, sizeof Q);
     for (i = 0; i < UKF_N; i++) Q[i * UKF_N + i] = UKF_WALK[i];
     if (ukf_since < UKF_HOLD_AFTER) Q[UKF_P_M * UKF_N + UKF_P_M] *= UKF_STEADY;
+    if (ukf_mean > UKF_LIMIT_CALM) Q[UKF_OMEGA_BUS * UKF_N + UKF_OMEGA_BUS] *= UKF_RESTLESS;
     ukf_wandered(ukf_x + UKF_BUS, UKF_WALK_DELTA, UKF_WALK_V_BUS, Q + UKF_BUS * UKF_N + UKF_BUS, UKF_N);
     if (!ukf_held) Q[UKF_X_S * UKF_N + UKF_X_S] = UKF_WALK_X_S * UKF_WALK_X_S;
     if (!ukf_predict(Q)) return 0;

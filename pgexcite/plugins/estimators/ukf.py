@@ -44,6 +44,9 @@ _JUMPS = (_MODERATE, _SEVERE)
 """In the order in which they are tried."""
 _STEADY = 0.3
 """Share of its random walk that the torque keeps right after a change: a swing is faster than a turbine."""
+_RESTLESS = 20.0
+"""Factor on the random walk of the bus's frequency while measurements are not quite as expected: without an infinite bus it moves
+whenever load or generation does."""
 _LATE_FLUX = 3e-3
 """What a change somewhere within the last sample adds to the deviation of the fluxes, which do not jump, pu."""
 _LATE_OMEGA = 2.0
@@ -210,6 +213,8 @@ class _Tracker:
         walk = self._walk.copy()
         if self._since < options.hold_after:
             walk[self.layout.p_m, self.layout.p_m] *= _STEADY**2
+        if self._mean > options.limit_calm:
+            walk[self.layout.omega_bus, self.layout.omega_bus] *= _RESTLESS**2
         walk[self._bus, self._bus] = wandered(before[self._bus], options.walk_delta, options.walk_v_bus)
         if not self._network.held:
             walk[self.layout.x_s, self.layout.x_s] = options.walk_x_s**2
@@ -344,6 +349,7 @@ class _Tracker:
             "held": HELD,
             "lowest": LOWEST,
             "steady": _STEADY**2,
+            "restless": _RESTLESS**2,
             "start_aside": float(first["network:aside"]),
             "told": len(_TOLD),
             "n_jumps": len(_JUMPS),
