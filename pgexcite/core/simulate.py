@@ -281,9 +281,8 @@ class Simulation:
                 known = path in self.model.index["u"] or path in self.model.index["p"]
                 if not known and _switched(path) not in self._controllers:
                     near = _nearest(self.model, path)
-                    problems.append(
-                        Problem(path, f"no such parameter or set-point (event at t = {change.t:g} s)", hint=near)
-                    )
+                    when = f"event at t = {change.t:g} s" if change.when is None else f"event when {change.when}"
+                    problems.append(Problem(path, f"no such parameter or set-point ({when})", hint=near))
         if problems:
             raise ConfigError(problems)
 

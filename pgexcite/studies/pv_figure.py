@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -60,20 +61,19 @@ def _normalised(curve: PVCurve) -> PVCurve:
     return replace(curve, P=curve.P / curve.S_base, Q=curve.Q / curve.S_base)
 
 
-def _draw_surface(ax: object, curves: Sequence[tuple[str, PVCurve]], bus: str, units: tuple[str, str]) -> None:
+def _draw_surface(plot: Any, curves: Sequence[tuple[str, PVCurve]], bus: str, units: tuple[str, str]) -> None:
     """The surface as wires along the curves and across them at equal shares of their length."""
     rows = [_even(curve, bus) for _, curve in curves]
     P, Q, V = (np.array([row[k] for row in rows]) for k in range(3))
-    plot = ax  # matplotlib's 3-D axes have no types
-    plot.plot_surface(P, Q, V, cmap="viridis", alpha=0.65, linewidth=0, rcount=len(curves), ccount=_ALONG)  # type: ignore[attr-defined]
+    plot.plot_surface(P, Q, V, cmap="viridis", alpha=0.65, linewidth=0, rcount=len(curves), ccount=_ALONG)
     for k, row in enumerate(rows):
-        plot.plot(*row, color=COLOURS[k % len(COLOURS)], linewidth=1.4)  # type: ignore[attr-defined]
+        plot.plot(*row, color=COLOURS[k % len(COLOURS)], linewidth=1.4)
     noses = np.array([(c.P_max, float(c.Q[c.nose]), c.V[bus][c.nose]) for _, c in curves]).T
-    plot.plot(*noses, "--", color="#24292f", linewidth=1.2)  # type: ignore[attr-defined]
-    plot.set_xlabel(f"P [{units[0]}]")  # type: ignore[attr-defined]
-    plot.set_ylabel(f"Q [{units[1]}]")  # type: ignore[attr-defined]
-    plot.set_zlabel(f"V at {bus} [pu]")  # type: ignore[attr-defined]
-    plot.view_init(elev=24, azim=-128)  # type: ignore[attr-defined]
+    plot.plot(*noses, "--", color="#24292f", linewidth=1.2)
+    plot.set_xlabel(f"P [{units[0]}]")
+    plot.set_ylabel(f"Q [{units[1]}]")
+    plot.set_zlabel(f"V at {bus} [pu]")
+    plot.view_init(elev=24, azim=-128)
 
 
 def _even(curve: PVCurve, bus: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
