@@ -283,13 +283,17 @@ def test_four_on_their_equivalents_keep_moving_each_other():
     """Each takes the others' reaction for a change of the network. The stabilisers leave 0.1 degrees of the swing."""
     sim, ending = run("step_equivalent")
     assert ending == "completed"
-    assert swing(sim, 8.0, 10.0) > 0.15  # measured 15
-    assert sum(sim.trace()[f"controller.G{k}.network_change"].max() > 0 for k in UNITS) >= 1  # measured 4
+    assert swing(sim, 8.0, 10.0) > 0.15  # measured 0.89
+    assert (
+        sum(sim.trace()[f"controller.G{k}.network_change"].max() > 0 for k in UNITS) >= 1
+    )  # measured 1, of 11 changes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("P", "kept"), [(1e5, False), (5.0, True)])
-def test_four_on_their_equivalents_keep_the_fault_only_when_they_do_not_chase_the_speed(P, kept):
-    sim, ending = run("fault_equivalent", *of_each(P=P))
-    assert ending == ("completed" if kept else "lost_synchronism")
-    assert kept or sim.outcome.t < 3.0  # measured 2.04
+def test_four_on_their_equivalents_lose_the_fault_the_sooner_the_more_they_chase_the_speed():
+    lost = {}
+    for P in (1e5, 5.0):
+        sim, ending = run("fault_equivalent", *of_each(P=P))
+        assert ending == "lost_synchronism"
+        lost[P] = sim.outcome.t
+    assert lost[1e5] < 4.0 < lost[5.0]  # measured 2.43 and 7.74
