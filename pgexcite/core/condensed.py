@@ -3,32 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.mpc import Problem
-from pgexcite.core.qp import QPSolution, QuadraticProgram
+from pgexcite.core.program import Program, QPSolver, Rows
+from pgexcite.core.qp import WarmSolver
 
 Array = NDArray[np.float64]
-
-
-class QPSolver(Protocol):
-    """Solves ``min x'Hx/2 + g'x`` subject to box and rows; see ``pgexcite.core.qp``."""
-
-    def solve(
-        self,
-        H: Array,
-        g: Array,
-        lower: Array,
-        upper: Array,
-        rows: Array | None = None,
-        rows_lower: Array | None = None,
-        rows_upper: Array | None = None,
-    ) -> QPSolution:
-        """Solve; ``solved`` says whether it did."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -82,7 +66,7 @@ class Condensed:
 
     Args:
         problem: the control problem.
-        solver: of programs with ``variables`` variables and ``rows`` rows; ``QuadraticProgram`` where left out.
+        solver: of programs with ``variables`` variables and ``rows`` rows; ``WarmSolver`` where left out.
     """
 
     def __init__(self, problem: Problem, solver: QPSolver | None = None) -> None:
@@ -93,7 +77,7 @@ class Condensed:
         self._rate = bool(np.isfinite(problem.du_max).any())
         self.variables = self.n + self._n_slack
         self.rows = (self.n if self._rate else 0) + 2 * self._n_slack
-        self.solver: QPSolver = solver or QuadraticProgram(self.variables, self.rows)
+        self.solver: QPSolver = solver or WarmSolver(self.variables, self.rows)
         # Moves are differences of consecutive commands: moves = difference @ plan - (last command, 0, ...).
         self._difference = np.eye(self.n) - np.eye(self.n, k=-n_u)
         weights = np.concatenate((problem.Q, problem.P))
@@ -162,16 +146,14 @@ class Condensed:
         """The program's step from a plan; ``None`` where it was not solved."""
         H, g, value = tracked = self.quadratic(at, plan, u_last)
         lower, upper = self._lower - plan.ravel(), self._upper - plan.ravel()
-        rows = rows_lower = rows_upper = None
-        if self.rows:
-            rows, rows_lower, rows_upper = self._constraints(at, plan, u_last)
+        rows = self._constraints(at, plan, u_last) if self.rows else None
         if self._n_slack:
             H = self._slack_hessian.copy()
             H[: self.n, : self.n] = tracked[0]
             g = np.concatenate((g, np.zeros(self._n_slack)))
             lower = np.concatenate((lower, np.zeros(self._n_slack)))
             upper = np.concatenate((upper, np.full(self._n_slack, np.inf)))
-        solution = self.solver.solve(H, g, lower, upper, rows, rows_lower, rows_upper)
+        solution = self.solver.solve(Program(H, g, lower, upper, rows))
         if not solution.solved:
             return None
         step = solution.x[: self.n]
@@ -184,7 +166,7 @@ class Condensed:
             cost += float(np.sum(self._soft_weight * self._excess(y[:, self._n_tracked :] + along) ** 2))
         return Direction(step.reshape(plan.shape), slope, cost)
 
-    def _constraints(self, at: Linearised, plan: Array, u_last: Array) -> tuple[Array, Array, Array]:
+    def _constraints(self, at: Linearised, plan: Array, u_last: Array) -> Rows:
         blocks, low, high = [], [], []
         if self._rate:
             moves = self._moves(plan, u_last)
@@ -202,7 +184,7 @@ class Condensed:
             blocks += [np.hstack((G, -slack)), np.hstack((G, slack))]
             low += [-nothing, lower]
             high += [upper, nothing]
-        return np.vstack(blocks), np.concatenate(low), np.concatenate(high)
+        return Rows(np.vstack(blocks), np.concatenate(low), np.concatenate(high))
 
     def clipped(self, plan: Array) -> Array:
         """A plan within the bounds on commands."""

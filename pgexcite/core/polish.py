@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
+from pgexcite.core.program import Program
+
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
@@ -18,26 +20,17 @@ _EXCHANGES = 5
 _CROSSED = 1e-12
 
 
-def polished(
-    H: Array,
-    g: Array,
-    lower: Array,
-    upper: Array,
-    rows: Array | None,
-    rows_lower: Array | None,
-    rows_upper: Array | None,
-    x: Array,
-    multipliers: Array,
-) -> tuple[Array, Array]:
-    """Minimiser and multipliers from those a solver has found, as in ``pgexcite.core.qp.QPSolution``.
+def polished(program: Program, x: Array, multipliers: Array) -> tuple[Array, Array]:
+    """Minimiser and multipliers from those a solver has found, as in ``pgexcite.core.program.QPSolution``.
 
     Returns:
         The exact ones, where they satisfy the optimality conditions no worse; else those of the solver.
     """
-    stacked, low, high = np.eye(g.size), lower, upper
-    if rows is not None and rows_lower is not None and rows_upper is not None:
-        stacked = np.concatenate((rows, stacked))
-        low, high = np.concatenate((rows_lower, lower)), np.concatenate((rows_upper, upper))
+    H, g, low, high, rows = program
+    stacked = np.eye(g.size)
+    if rows is not None:
+        stacked = np.concatenate((rows.matrix, stacked))
+        low, high = np.concatenate((rows.lower, low)), np.concatenate((rows.upper, high))
     values = stacked @ x
     # Of an active constraint the multiplier is what is large, of another one the distance.
     at_low, at_high = values - low < -multipliers, high - values < multipliers

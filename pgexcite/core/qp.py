@@ -10,15 +10,13 @@ finds is made exact by ``pgexcite.core.polish``.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 import proxsuite
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from pgexcite.core.polish import polished
+from pgexcite.core.program import Program, QPSolution
 
 Array = NDArray[np.float64]
 
@@ -35,24 +33,7 @@ _STATIONARY = 1e-9
 """Largest slope, against the largest one of the program, that is left where a variable is free of its bounds."""
 
 
-@dataclass(frozen=True)
-class QPSolution:
-    """Minimiser of ``x'Hx/2 + g'x`` subject to ``lower <= x <= upper`` and ``rows_lower <= rows x <= rows_upper``.
-
-    Attributes:
-        x: shape ``(n,)``.
-        multipliers: of the rows, then of the box, positive at an upper bound, shape ``(m + n,)``.
-        solved: whether the optimality conditions hold to the solver's tolerance.
-        iterations: inner iterations of the solver.
-    """
-
-    x: Array
-    multipliers: Array
-    solved: bool
-    iterations: int
-
-
-class QuadraticProgram:
+class WarmSolver:
     """Solves programs of one size, each warm-started from the last solution.
 
     The warm start is a value (``memory``), not a state of the solver: a run resumed from a snapshot gives the same bits.
@@ -88,44 +69,35 @@ class QuadraticProgram:
         """Start the next solve from these multipliers."""
         self._multipliers = multipliers.copy()
 
-    def solve(
-        self,
-        H: Array,
-        g: Array,
-        lower: Array,
-        upper: Array,
-        rows: Array | None = None,
-        rows_lower: Array | None = None,
-        rows_upper: Array | None = None,
-    ) -> QPSolution:
+    def solve(self, program: Program) -> QPSolution:
         """Solve; never raises on bad numbers: an unusable input or an uncapped iteration gives ``solved = False``."""
         n, m = self._n, self._m
-        if not usable(H, g, lower, upper, rows, rows_lower, rows_upper):
+        if not program.usable():
             return QPSolution(np.zeros(n), np.zeros(m + n), False, 0)
-        if not m:
-            found = exchange(H, g, lower, upper, self._multipliers)
+        if program.rows is None:
+            found = exchange(program, self._multipliers)
             if found is not None:
                 self._multipliers = found.multipliers
                 return found
-        if m:
-            self._rows[:m], self._low[:m], self._high[:m] = rows, rows_lower, rows_upper
-        self._low[m:], self._high[m:] = lower, upper
+        else:
+            self._rows[:m], self._low[:m], self._high[:m] = program.rows
+        self._low[m:], self._high[m:] = program.lower, program.upper
         # Bounds that do not exist are large numbers to ProxQP, not infinities.
         low, high = np.maximum(self._low, -WIDE), np.minimum(self._high, WIDE)
-        solved, x, z, iterations = self._run(H, g, low, high, self._multipliers)
+        solved, x, z, iterations = self._run(program, low, high, self._multipliers)
         if not solved and self._multipliers.any():
             # Multipliers of a program that was too different lead it astray now and then.
-            solved, x, z, more = self._run(H, g, low, high, np.zeros(m + n))
+            solved, x, z, more = self._run(program, low, high, np.zeros(m + n))
             iterations += more
         if solved:
-            x, z = polished(H, g, lower, upper, rows, rows_lower, rows_upper, x, z)
+            x, z = polished(program, x, z)
         self._multipliers = z if solved else np.zeros(m + n)
         # The tolerance leaves a bound crossed by up to eps; what reaches a plant must not be.
-        return QPSolution(np.clip(x, lower, upper), z, solved, iterations)
+        return QPSolution(np.clip(x, program.lower, program.upper), z, solved, iterations)
 
-    def _run(self, H: Array, g: Array, low: Array, high: Array, start: Array) -> tuple[bool, Array, Array, int]:
+    def _run(self, program: Program, low: Array, high: Array, start: Array) -> tuple[bool, Array, Array, int]:
         """ProxQP from these multipliers: whether it has solved it, minimiser, multipliers, iterations."""
-        self._qp.init(H, g, None, None, self._rows, low, high)
+        self._qp.init(program.H, program.g, None, None, self._rows, low, high)
         self._qp.solve(np.zeros(self._n), self._no_equality, start)
         results = self._qp.results
         x, z = np.array(results.x), np.array(results.z)
@@ -133,7 +105,7 @@ class QuadraticProgram:
         return solved, x, z, int(results.info.iter)
 
 
-def exchange(H: Array, g: Array, lower: Array, upper: Array, multipliers: Array) -> QPSolution | None:
+def exchange(program: Program, multipliers: Array) -> QPSolution | None:
     """Block principal pivoting for a program with bounds only, started from the bounds these multipliers are of.
 
     J. J. Judice, F. M. Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity
@@ -143,6 +115,7 @@ def exchange(H: Array, g: Array, lower: Array, upper: Array, multipliers: Array)
     Returns:
         The minimiser; ``None`` where ``H`` is not positive definite, or the active set is not found in ``_MAX_EXCHANGES``.
     """
+    H, g, lower, upper, _ = program
     stationary = _STATIONARY * max(1.0, float(np.abs(g).max()))
     if not multipliers.any():
         _, x, failed = dposv(H, -g)
@@ -181,21 +154,3 @@ def exchange(H: Array, g: Array, lower: Array, upper: Array, multipliers: Array)
         # What is at a bound is freed; what is free goes to the bound it has crossed.
         at_upper, at_lower = (at_upper & ~wrong) | (over & wrong), (at_lower & ~wrong) | (under & wrong)
     return None
-
-
-def usable(
-    H: Array,
-    g: Array,
-    lower: Array,
-    upper: Array,
-    rows: Array | None,
-    rows_lower: Array | None,
-    rows_upper: Array | None,
-) -> bool:
-    """Whether a solver may be handed this: finite, and no bound above its opposite (a NaN compares false)."""
-    # A sum is finite only if every term is: cheaper than a look at each.
-    if not math.isfinite(H.sum() + g.sum()) or not (lower <= upper).all():
-        return False
-    if rows is None or rows_lower is None or rows_upper is None:
-        return True
-    return bool(math.isfinite(rows.sum()) and (rows_lower <= rows_upper).all())

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from pgexcite.core import registry
 from pgexcite.core.polish import polished
-from pgexcite.core.qp import WIDE, QPSolution, usable
+from pgexcite.core.program import Program, QPSolution, Rows
+from pgexcite.core.qp import WIDE
 
 Array = NDArray[np.float64]
 
@@ -68,28 +69,20 @@ class NamedSolver:
         self._name, self._settings = name, _SETTINGS.get(name, {})
         self._sparse = name not in qpsolvers.dense_solvers
 
-    def solve(
-        self,
-        H: Array,
-        g: Array,
-        lower: Array,
-        upper: Array,
-        rows: Array | None = None,
-        rows_lower: Array | None = None,
-        rows_upper: Array | None = None,
-    ) -> QPSolution:
+    def solve(self, program: Program) -> QPSolution:
         """Solve; an unusable input or a solver that gives up gives ``solved = False``, whatever it leaves in ``x``."""
-        n = g.size
+        n = program.g.size
         nothing = QPSolution(np.zeros(n), np.zeros(0), False, 0)
-        if not usable(H, g, lower, upper, rows, rows_lower, rows_upper):
+        if not program.usable():
             return nothing
-        rows, rows_lower, rows_upper, lower, upper = _folded(rows, rows_lower, rows_upper, lower, upper)
-        G, h = _one_sided(rows, rows_lower, rows_upper)
+        program = _one_sided(_folded(program))
+        H, g, lower, upper, rows = program
         if not (lower <= upper).all():
             return nothing
         lb, ub = lower, upper
         if self._name == "proxqp":  # to it a bound that does not exist is a large number, not an infinity
             lb, ub = np.maximum(lower, -WIDE), np.minimum(upper, WIDE)
+        G, h = (None, None) if rows is None else (rows.matrix, rows.upper)
         problem = qpsolvers.Problem((H + H.T) / 2, g, G, h, None, None, lb, ub)
         if self._sparse:
             problem = _sparse(problem)
@@ -102,41 +95,37 @@ class NamedSolver:
         x = solution.x
         if solution.z is not None and solution.z_box is not None:
             multipliers = np.concatenate((solution.z, solution.z_box))
-            x, _ = polished(H, g, lower, upper, G, *_sides(h), x, multipliers)
+            x, _ = polished(program, x, multipliers)
         return QPSolution(np.clip(x, lower, upper), np.zeros(0), True, 0)
 
 
-def _folded(
-    rows: Array | None, rows_lower: Array | None, rows_upper: Array | None, lower: Array, upper: Array
-) -> tuple[Array | None, Array | None, Array | None, Array, Array]:
-    """Rows of one variable as bounds of it.
+def _folded(program: Program) -> Program:
+    """The program with its rows of one variable as bounds of that variable.
 
     Two parallel rows, one inside the other, have opposite multipliers that ProxQP takes for a certificate of infeasibility, and
     qpsolvers does not pass its tolerance on.
     """
-    if rows is None or rows_lower is None or rows_upper is None:
-        return rows, rows_lower, rows_upper, lower, upper
-    alone = np.count_nonzero(rows, axis=1) == 1
-    lower, upper = lower.copy(), upper.copy()
-    for row, low, high in zip(rows[alone], rows_lower[alone], rows_upper[alone], strict=True):
+    rows = program.rows
+    if rows is None:
+        return program
+    alone = np.count_nonzero(rows.matrix, axis=1) == 1
+    lower, upper = program.lower.copy(), program.upper.copy()
+    for row, low, high in zip(*(part[alone] for part in rows), strict=True):
         k = int(np.flatnonzero(row)[0])
         ends = sorted((low / row[k], high / row[k]))
         lower[k], upper[k] = max(lower[k], ends[0]), min(upper[k], ends[1])
-    return rows[~alone], rows_lower[~alone], rows_upper[~alone], lower, upper
+    return Program(program.H, program.g, lower, upper, Rows(*(part[~alone] for part in rows)))
 
 
-def _one_sided(rows: Array | None, lower: Array | None, upper: Array | None) -> tuple[Array | None, Array | None]:
-    """``G x <= h`` of two-sided rows; sides that do not exist are left out."""
-    if rows is None or lower is None or upper is None:
-        return None, None
-    above, below = np.isfinite(upper), np.isfinite(lower)
-    G = np.vstack((rows[above], -rows[below]))
-    return (G, np.concatenate((upper[above], -lower[below]))) if G.size else (None, None)
-
-
-def _sides(h: Array | None) -> tuple[Array | None, Array | None]:
-    """Bounds of one-sided rows."""
-    return (None, None) if h is None else (np.full(h.size, -np.inf), h)
+def _one_sided(program: Program) -> Program:
+    """The program with upper bounds only on its rows; sides that do not exist are left out."""
+    rows = program.rows
+    if rows is None:
+        return program
+    above, below = np.isfinite(rows.upper), np.isfinite(rows.lower)
+    G = np.vstack((rows.matrix[above], -rows.matrix[below]))
+    h = np.concatenate((rows.upper[above], -rows.lower[below]))
+    return program._replace(rows=Rows(G, np.full(h.size, -np.inf), h) if h.size else None)
 
 
 def _sparse(problem: qpsolvers.Problem) -> qpsolvers.Problem:

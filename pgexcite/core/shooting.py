@@ -12,13 +12,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.condensed import Condensed, Curvature, Direction, Linearised, QPSolver
+from pgexcite.core.condensed import Condensed, Curvature, Direction, Linearised
 from pgexcite.core.controller import Sample
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem, Solution, Status
 from pgexcite.core.prediction import Horizon, Predictor, Rollout
-from pgexcite.core.qp import QuadraticProgram
+from pgexcite.core.program import QPSolver
+from pgexcite.core.qp import WarmSolver
 from pgexcite.core.settings import Rule
 from pgexcite.core.step import Kernel
 
@@ -87,7 +88,7 @@ class Shooting(ABC):
         rule: integration rule of the prediction.
         h: prediction step in the first interval, s.
         grid: the plant's step, s.
-        qp: solver of the programs; ``QuadraticProgram`` where left out.
+        qp: solver of the programs; ``WarmSolver`` where left out.
     """
 
     def __init__(
@@ -163,7 +164,7 @@ class Shooting(ABC):
             kept["plan"] = self._plan
         if self._prepared is not None:
             kept |= {f"prepared:{name}": value for name, value in self._prepared.arrays().items()}
-        if isinstance(solver := self.condensed.solver, QuadraticProgram):
+        if isinstance(solver := self.condensed.solver, WarmSolver):
             kept["multipliers"] = solver.memory()
         return kept
 
@@ -173,7 +174,7 @@ class Shooting(ABC):
         start = "prepared:"
         prepared = {key.removeprefix(start): value for key, value in memory.items() if key.startswith(start)}
         self._ready(_Prepared(**prepared) if prepared else None)
-        if isinstance(solver := self.condensed.solver, QuadraticProgram):
+        if isinstance(solver := self.condensed.solver, WarmSolver):
             solver.recall(memory["multipliers"])
 
     # Planning.

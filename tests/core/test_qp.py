@@ -6,18 +6,20 @@ import numpy as np
 import pytest
 import qpsolvers
 
-from pgexcite.core.qp import QuadraticProgram
+from pgexcite.core.program import Program, Rows
+from pgexcite.core.qp import WarmSolver
 from pgexcite.core.qp_by_name import NamedSolver
 
 H = np.array([[8.717771058826e-02, 1.953443127785], [1.953443127785, 379.8883179443]])
 G = np.array([-0.221793460823, -25.817593903047])
 
 
-@pytest.mark.parametrize("solver", [QuadraticProgram(2, 2), NamedSolver("proxqp"), NamedSolver("daqp")])
+@pytest.mark.parametrize("solver", [WarmSolver(2, 2), NamedSolver("proxqp"), NamedSolver("daqp")])
 def test_a_move_bound_beside_a_command_bound_is_no_contradiction(solver):
     """Parallel rows, one inside the other: with its default tolerance ProxQP calls this infeasible after four iterations."""
     lower, upper = np.array([-0.611732817719, -0.534319313605]), np.array([0.008267182281, 0.965680686395])
-    found = solver.solve(H, G, lower, upper, np.eye(2), np.array([-0.01, -1.0]), np.array([0.01, 1.0]))
+    rows = Rows(np.eye(2), np.array([-0.01, -1.0]), np.array([0.01, 1.0]))
+    found = solver.solve(Program(H, G, lower, upper, rows))
     assert found.solved
     first = upper[0]
     assert found.x == pytest.approx([first, -(G[1] + H[1, 0] * first) / H[1, 1]], abs=1e-9)
@@ -33,9 +35,9 @@ def test_random_programs_agree_with_an_active_set_solver(seed, named):
     rows = np.eye(n) - np.eye(n, k=-1)
     lower, upper = -draw.uniform(0, 1, n), draw.uniform(0, 1, n)
     reach = draw.uniform(0.01, 1, n)
-    program = NamedSolver("proxqp") if named else QuadraticProgram(n, n)
+    solver = NamedSolver("proxqp") if named else WarmSolver(n, n)
     for _ in range(2):  # cold, then warm
-        found = program.solve(hessian, gradient, lower, upper, rows, -reach, reach)
+        found = solver.solve(Program(hessian, gradient, lower, upper, Rows(rows, -reach, reach)))
         wanted = qpsolvers.solve_qp(
             hessian, gradient, np.vstack((rows, -rows)), np.tile(reach, 2), lb=lower, ub=upper, solver="daqp"
         )
@@ -49,19 +51,62 @@ def test_random_programs_agree_with_an_active_set_solver(seed, named):
 def test_multipliers_of_an_unlike_program_do_not_lead_astray(seed):
     draw = np.random.default_rng(seed)
     n = int(draw.integers(1, 9))
-    program, rows = QuadraticProgram(n, n), np.eye(n) - np.eye(n, k=-1)
+    solver, rows = WarmSolver(n, n), np.eye(n) - np.eye(n, k=-1)
     for _ in range(8):
         root = draw.normal(size=(n, n))
         hessian = root @ root.T * 10 ** draw.uniform(-3, 2) + 0.02 * np.eye(n)
         gradient = 10 ** draw.uniform(-1, 2) * draw.normal(size=n)
         lower = -draw.uniform(0, 3, n) * (draw.random(n) < 0.8)
         upper, reach = draw.uniform(0, 3, n) * (draw.random(n) < 0.8), draw.uniform(0.01, 1, n)
-        assert program.solve(hessian, gradient, lower, upper, rows, -reach, reach).solved
+        assert solver.solve(Program(hessian, gradient, lower, upper, Rows(rows, -reach, reach))).solved
 
 
 def test_a_contradiction_is_not_solved():
-    program = QuadraticProgram(2, 1)
-    low, high = np.full(2, -1.0), np.ones(2)
-    found = program.solve(np.eye(2), np.zeros(2), low, high, np.ones((1, 2)), np.array([3.0]), np.array([4.0]))
+    solver, box = WarmSolver(2, 1), Program(np.eye(2), np.zeros(2), np.full(2, -1.0), np.ones(2))
+    found = solver.solve(box._replace(rows=Rows(np.ones((1, 2)), np.array([3.0]), np.array([4.0]))))
     assert not found.solved
-    assert program.solve(np.eye(2), np.zeros(2), low, high, np.ones((1, 2)), np.array([1.0]), np.array([4.0])).solved
+    assert solver.solve(box._replace(rows=Rows(np.ones((1, 2)), np.array([1.0]), np.array([4.0])))).solved
+
+
+def test_the_optimality_conditions_hold():
+    rng = np.random.default_rng(1)
+    for n, m in ((1, 0), (5, 0), (8, 8), (20, 20)):
+        for _ in range(20):
+            A = rng.normal(size=(n, n))
+            H, g = A @ A.T + 1e-3 * np.eye(n), 10 * rng.normal(size=n)
+            lower, upper = -rng.random(n), rng.random(n)
+            rows, reach = rng.normal(size=(m, n)), np.full(m, 0.5)
+            program = Program(H, g, lower, upper, Rows(rows, -reach, reach) if m else None)
+            solution = WarmSolver(n, m).solve(program)
+            assert solution.solved
+            x, y = solution.x, solution.multipliers
+            C = np.vstack((rows, np.eye(n)))
+            low, high = np.concatenate((-reach, lower)), np.concatenate((reach, upper))
+            value = C @ x
+            assert np.abs(H @ x + g + C.T @ y).max() < 1e-8  # stationarity
+            assert np.all(value <= high + 1e-9)
+            assert np.all(value >= low - 1e-9)
+            slack = np.where(y > 0, high - value, value - low)
+            assert np.abs(y * slack).max() < 1e-7  # complementarity
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"H": np.array([[np.nan]])},
+        {"g": np.array([np.inf])},
+        {"lower": np.array([1.0]), "upper": np.array([0.0])},
+        {"lower": np.array([np.nan])},
+    ],
+)
+def test_it_refuses_what_would_stall_the_solver(broken):
+    data = {"H": np.eye(1), "g": np.ones(1), "lower": -np.ones(1), "upper": np.ones(1)} | broken
+    assert not WarmSolver(1, 0).solve(Program(**data)).solved
+
+
+def test_contradictory_rows_end_quickly_and_unsolved():
+    rows = np.array([[1.0, 1.0], [1.0, 1.0]])
+    contradictory = Rows(rows, np.array([1.0, -2.0]), np.array([1.5, -1.0]))
+    solution = WarmSolver(2, 2).solve(Program(np.eye(2), np.zeros(2), -np.ones(2), np.ones(2), contradictory))
+    assert not solution.solved
+    assert solution.iterations <= 60 * 60

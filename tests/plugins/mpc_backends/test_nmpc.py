@@ -11,7 +11,6 @@ from pgexcite.core.controller import Plant, Sample, Surroundings
 from pgexcite.core.errors import ConfigError
 from pgexcite.core.events import Fault
 from pgexcite.core.mpc import Status
-from pgexcite.core.qp import QuadraticProgram
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.step import Kernel
@@ -149,51 +148,6 @@ def test_bounds_on_the_move_hold():
     u_last, solution = solve(sim, solver)
     moves = np.diff(solution.u.ravel(), prepend=u_last)
     assert np.abs(moves).max() == pytest.approx(0.3, abs=1e-8)
-
-
-def test_qp_satisfies_its_optimality_conditions():
-    rng = np.random.default_rng(1)
-    for n, m in ((1, 0), (5, 0), (8, 8), (20, 20)):
-        for _ in range(20):
-            A = rng.normal(size=(n, n))
-            H, g = A @ A.T + 1e-3 * np.eye(n), 10 * rng.normal(size=n)
-            lower, upper = -rng.random(n), rng.random(n)
-            rows = rng.normal(size=(m, n)) if m else None
-            reach = np.full(m, 0.5)
-            solution = QuadraticProgram(n, m).solve(H, g, lower, upper, rows, -reach, reach)
-            assert solution.solved
-            x, y = solution.x, solution.multipliers
-            C = np.vstack((rows, np.eye(n))) if m else np.eye(n)
-            low, high = np.concatenate((-reach, lower)), np.concatenate((reach, upper))
-            value = C @ x
-            assert np.abs(H @ x + g + C.T @ y).max() < 1e-8  # stationarity
-            assert np.all(value <= high + 1e-9)
-            assert np.all(value >= low - 1e-9)
-            slack = np.where(y > 0, high - value, value - low)
-            assert np.abs(y * slack).max() < 1e-7  # complementarity
-
-
-@pytest.mark.parametrize(
-    "broken",
-    [
-        {"H": np.array([[np.nan]])},
-        {"g": np.array([np.inf])},
-        {"lower": np.array([1.0]), "upper": np.array([0.0])},
-        {"lower": np.array([np.nan])},
-    ],
-)
-def test_qp_refuses_what_would_stall_the_solver(broken):
-    data = {"H": np.eye(1), "g": np.ones(1), "lower": -np.ones(1), "upper": np.ones(1)} | broken
-    assert not QuadraticProgram(1, 0).solve(**data).solved
-
-
-def test_contradictory_rows_end_quickly_and_unsolved():
-    rows = np.array([[1.0, 1.0], [1.0, 1.0]])
-    solution = QuadraticProgram(2, 2).solve(
-        np.eye(2), np.zeros(2), -np.ones(2), np.ones(2), rows, np.array([1.0, -2.0]), np.array([1.5, -1.0])
-    )
-    assert not solution.solved
-    assert solution.iterations <= 60 * 60
 
 
 def test_a_model_that_is_wrong_about_a_parameter_predicts_with_it_from_the_true_state():
