@@ -26,9 +26,13 @@ _EPS_INFEASIBLE = 1e-30
 WIDE = 1e20
 _MAX_ITERATIONS = 60
 _MAX_INNER_ITERATIONS = 60
+
 _MAX_EXCHANGES = 20
+"""How often ``exchange`` changes the active set before it gives up."""
 _PATIENCE = 3
+"""How many times in a row the variables on a wrong side may get no fewer before they change it one at a time."""
 _CROSSED = 1e-12
+"""What a variable may be beyond its bound, by rounding."""
 _STATIONARY = 1e-9
 """Largest slope, against the largest one of the program, that is left where a variable is free of its bounds."""
 
@@ -154,3 +158,9 @@ def exchange(program: Program, multipliers: Array) -> QPSolution | None:
         # What is at a bound is freed; what is free goes to the bound it has crossed.
         at_upper, at_lower = (at_upper & ~wrong) | (over & wrong), (at_lower & ~wrong) | (under & wrong)
     return None
+
+
+def limits() -> dict[str, object]:
+    """What ``qp.c`` is to know in order to exchange as ``exchange`` does."""
+    found = {"max_exchanges": _MAX_EXCHANGES, "patience": _PATIENCE, "crossed": _CROSSED, "stationary": _STATIONARY}
+    return {f"qp_{name}": value for name, value in found.items()}

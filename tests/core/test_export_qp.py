@@ -11,10 +11,9 @@ from exported import STRICT, compiler
 from scipy.optimize import nnls
 
 from pgexcite.core import codegen
+from pgexcite.core.qp import limits
 
 SOURCE = """
-#define N_V {n}
-#define N_ROWS {m}
 {text}
 int solve_qp(const double *H, const double *g, const double *l, const double *u, const double *A, const double *a, const double *b,
              const double *give, double *x);
@@ -31,7 +30,9 @@ int solve_qp(const double *H, const double *g, const double *l, const double *u,
 def library(folder, n, m):
     """Solver of programs of ``n`` variables and ``m`` rows: arrays in, whether it was solved and the minimiser out."""
     name = f"qp_{n}_{m}"
-    (folder / f"{name}.c").write_text(SOURCE.format(n=n, m=m, text=codegen.loop("dense.c") + codegen.loop("qp.c")))
+    constants = codegen.define({"n_v": n, "n_rows": m, **limits()})
+    text = constants + codegen.loop("dense.c") + codegen.loop("qp.c")
+    (folder / f"{name}.c").write_text(SOURCE.format(text=text))
     command = [compiler(), *STRICT, "-fPIC", "-shared", f"{name}.c", "-o", f"{name}.so", "-lm"]
     subprocess.run(command, cwd=folder, check=True)
     function = ctypes.CDLL(str(folder / f"{name}.so")).solve_qp

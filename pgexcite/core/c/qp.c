@@ -9,7 +9,7 @@
 
    A program without rows is tried by block principal pivoting first, as pgexcite.core.qp does: a few small factorisations.
 
-   Goes below dense.c. Expects N_V variables and N_ROWS rows. */
+   Goes below dense.c. Expects N_V variables and N_ROWS rows, and the limits of pgexcite.core.qp (QP_...). */
 
 #include <math.h>
 #include <string.h>
@@ -17,8 +17,6 @@
 #define QP_BOUNDED (N_V + N_ROWS)
 #define QP_SPACE (QP_BOUNDED + 1)
 #define QP_MAX_ITERATIONS (10 * QP_BOUNDED + 50)
-#define QP_MAX_EXCHANGES 20
-#define QP_PATIENCE 3
 
 typedef struct {
     const double *H, *g;
@@ -190,8 +188,8 @@ static int qp_pivot(const Program *of, double *x) {
         for (i = 0; i < N_V; i++) {
             double slope = -of->g[i];
             for (j = 0; j < N_V; j++) slope -= of->H[i * N_V + j] * x[j];
-            if (!side[i] && !(fabs(slope) <= 1e-9 * scale)) return 0;
-            wrong[i] = side[i] ? side[i] * slope < 0 : x[i] > of->upper[i] + 1e-12 || x[i] < of->lower[i] - 1e-12;
+            if (!side[i] && !(fabs(slope) <= QP_STATIONARY * scale)) return 0;
+            wrong[i] = side[i] ? side[i] * slope < 0 : x[i] > of->upper[i] + QP_CROSSED || x[i] < of->lower[i] - QP_CROSSED;
             count += wrong[i];
             if (wrong[i]) last = i;
         }

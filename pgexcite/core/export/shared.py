@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pgexcite.core.condensed import Condensed
 from pgexcite.core.errors import Problem
 from pgexcite.core.ladder import MOVED, PLAUSIBLE, Ladder
+from pgexcite.core.qp import limits
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.float64] | NDArray[np.int32]
@@ -38,6 +39,7 @@ def program(condensed: Condensed) -> tuple[dict[str, object], dict[str, Numbers]
         "n_voltages": len(problem.voltages),
         "n_previews": len(problem.previews),
         "n_steps": len(problem.steps),
+        **limits(),
     }
     starts = np.arange(problem.N_c, dtype=float)[:, None]
     arrays: dict[str, Numbers] = {
