@@ -63,7 +63,9 @@ _TOLD = (
     "network_change",
     "network_held",
 )
-"""What an exported filter tells, in the order of ``ukf.c``."""
+"""What an exported filter tells."""
+_TEXTS = ("mapped_filter.c", "network.c", "ukf.c")
+"""What it is written as, in C."""
 
 
 class UKF(BaseModel):
@@ -327,13 +329,17 @@ class _Tracker:
     # As C.
 
     def written(self) -> Written:
-        """See ``pgexcite.core.estimation.Writable``; the text is ``ukf.c``."""
+        """See ``pgexcite.core.estimation.Writable``; the text is in ``_TEXTS``."""
         options, layout, kalman, first = self.options, self.layout, self._kalman, self.memory()
         constants = {
             "n": layout.size,
             "m": len(TERMINALS),
             "rotor": len(layout.rotor),
             "omega": layout.omega,
+            "p_m": layout.p_m,
+            "omega_bus": layout.omega_bus,
+            "x_s": layout.x_s,
+            "bus": layout.bus.start,
             "dt": self._dt,
             "omega_0": self._omega_0,
             "scale": kalman.points_fn.scale,
@@ -351,9 +357,12 @@ class _Tracker:
             "steady": _STEADY**2,
             "restless": _RESTLESS**2,
             "start_aside": float(first["network:aside"]),
-            "told": len(_TOLD),
+            "n_told": len(_TOLD),
             "n_jumps": len(_JUMPS),
+            "jump_size": len(Jump._fields),
         }
+        constants |= {f"jump_{name}": k for k, name in enumerate(Jump._fields)}
+        constants |= {f"told_{name}": k for k, name in enumerate(_TOLD)}
         bounds, walks = ("v_bus_min", "v_bus_max"), ("walk_delta", "walk_v_bus", "walk_x_s")
         clocks = ("hold_after", "settled_after", "patience", "warm_up")
         constants |= {name: getattr(options, name) for name in (*bounds, *walks, *clocks)}
@@ -375,6 +384,6 @@ class _Tracker:
             self._functions,
             {f"ukf_{name}": value for name, value in constants.items()},
             {f"UKF_{name.upper()}": np.array(values, dtype=float).ravel() for name, values in arrays.items()},
-            Path(__file__).with_name("ukf.c").read_text(encoding="utf-8"),
+            "\n".join(Path(__file__).with_name(name).read_text(encoding="utf-8") for name in _TEXTS),
             _TOLD,
         )
