@@ -80,6 +80,11 @@ class Model:
             near = get_close_matches(path, self.index[group], n=3)
             raise KeyError(f"no {path!r} in this model; nearest: {', '.join(near) or 'none'}") from None
 
+    def nearest(self, path: str) -> str:
+        """A hint for a path that is no output, command or parameter: those that resemble it, or ``""``."""
+        near = get_close_matches(path, (*self.u_names, *self.p_names, *self.y_names), n=3)
+        return f"nearest: {', '.join(near)}" if near else ""
+
     @cached_property
     def fingerprint(self) -> str:
         """Hash of the equations and the names; a snapshot belongs to the model of the same fingerprint."""
