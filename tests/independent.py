@@ -16,12 +16,12 @@ class Independent:
 
     def __init__(self, model: Model, state: State, p) -> None:
         self.model = model
-        mass = np.array(model.dae(state.x, state.z, state.d, state.u, p, 0.0)[1]).ravel()
+        mass = np.array(model.dae(state.x, state.z, state.d, state.u, p)[1]).ravel()
         self.dynamic, self.algebraic = np.flatnonzero(mass > 0), np.flatnonzero(mass == 0)
         self.mass = mass[self.dynamic]
         x, z = ca.SX.sym("x", state.x.size), ca.SX.sym("z", state.z.size)
         u, q = ca.SX.sym("u", state.u.size), ca.SX.sym("p", p.size)
-        f, _, _, _, g, _, y = model.dae(x, z, model.d_0, u, q, 0.0)
+        f, _, _, _, g, y = model.dae(x, z, model.d_0, u, q)
         unknown = ca.vertcat(*[x[int(k)] for k in self.algebraic], z)
         rows = ca.vertcat(*[f[int(k)] for k in self.algebraic], g)
         self.solve = ca.Function("solve", [x, z, u, q], [rows, ca.jacobian(rows, unknown), f])

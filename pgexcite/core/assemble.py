@@ -52,6 +52,7 @@ class Stated:
         outputs: port name -> expression, of all components together.
         current: injected current in per unit of the device's base.
         updates: ``(path, expression)`` of each discrete state.
+        befores: of each signal that ``updates`` want from the step's beginning, its symbol there and what it is.
         holds: ``(path, expression)`` of each constant of the initial point.
         limits: windup limits met, when stated with limits released, with the path of their component.
     """
@@ -61,6 +62,7 @@ class Stated:
     outputs: Mapping[str, Expr]
     current: tuple[Expr, Expr]
     updates: tuple[tuple[str, Expr], ...]
+    befores: tuple[tuple[Expr, Expr], ...]
     holds: tuple[tuple[str, Expr], ...]
     limits: tuple[tuple[str, Limit], ...] = ()
 
@@ -134,6 +136,7 @@ class Symbols:
                 value = np.nan if variable.kind is Kind.CONSTANT else (variable.default or 0.0)
                 own[variable.name] = tables[variable.kind].add(f"{path}.{variable.name}", value)
                 self.units[f"{path}.{variable.name}"] = variable.unit
+            own |= {item.name: ca.SX.sym(f"{path}.{item.name}") for item in component.variables(Kind.BEFORE)}
             self._own[path] = own
 
     def state(self, device: Device, *, released: bool = False) -> Stated:
@@ -158,7 +161,7 @@ class Symbols:
                     _put_in_series(device, path, port, inputs, outputs)
                 outputs[port] = value
         substitute = _wiring(device, inputs, outputs)
-        rows, alg, updates, holds = [], [], [], []
+        rows, alg, updates, befores, holds = [], [], [], [], []
         current = (ca.SX(0), ca.SX(0))
         for path, equations in stated.items():
             own = self._own[path]
@@ -177,6 +180,7 @@ class Symbols:
             updates += [
                 (f"{path}.{i.name}", substitute(equations.update[i.name])) for i in component.variables(Kind.DISCRETE)
             ]
+            befores += [(own[name], substitute(signal)) for name, signal in equations.before.items()]
             holds += [(f"{path}.{name}", substitute(value)) for name, value in equations.hold.items()]
             if equations.current is not None:
                 current = (substitute(equations.current[0]), substitute(equations.current[1]))
@@ -185,7 +189,7 @@ class Symbols:
             (path, Limit(item.label, substitute(item.signal), substitute(item.lower), substitute(item.upper)))
             for path, item in limits
         )
-        return Stated(tuple(rows), tuple(alg), wired, current, tuple(updates), tuple(holds), bounded)
+        return Stated(tuple(rows), tuple(alg), wired, current, tuple(updates), tuple(befores), tuple(holds), bounded)
 
     def _write(
         self, device: Device, path: str, component: Component, inputs: dict[str, list[Expr]], released: bool
@@ -227,7 +231,8 @@ def _check_declared(path: str, component: Component, equations: Equations) -> No
         f"{path}: {count} algebraic unknowns are declared, {len(equations.alg)} residuals are stated",
     )
     held = {name: value for name, value in equations.hold.items() if name not in declared[Kind.SETPOINT]}
-    for kind, stated in ((Kind.OUTPUT, equations.out), (Kind.DISCRETE, equations.update), (Kind.CONSTANT, held)):
+    mappings = {Kind.OUTPUT: equations.out, Kind.DISCRETE: equations.update, Kind.BEFORE: equations.before}
+    for kind, stated in (*mappings.items(), (Kind.CONSTANT, held)):
         missing, extra = set(declared[kind]) - set(stated), set(stated) - set(declared[kind])
         require(not missing, f"{path}: {kind.value} {', '.join(sorted(missing))} declared but not stated")
         require(not extra, f"{path}: {kind.value} {', '.join(sorted(extra))} stated but not declared")
@@ -308,11 +313,10 @@ def assemble(system: System) -> Model:
     reference, omega_ref = _reference(system, symbols, stated)
     rows = [item for s in stated.values() for item in s.rows]
     alg = [item for s in stated.values() for item in s.alg]
-    updates = [item for s in stated.values() for item in s.updates]
     flows, kirchhoff = _network(system, symbols, stated)
     y, units = _outputs(system, symbols, stated, flows)
     infinity = ca.SX(np.inf)
-    f, mass, lower, upper, g, d_next, y_vector = (
+    f, mass, lower, upper, g, y_vector = (
         ca.substitute(ca.vertcat(*items) if items else ca.SX(0, 1), symbols.omega_ref, omega_ref)
         for items in (
             [row.rhs for _, row in rows],
@@ -320,21 +324,21 @@ def assemble(system: System) -> Model:
             [-infinity if row.lower is None else row.lower for _, row in rows],
             [infinity if row.upper is None else row.upper for _, row in rows],
             [e for _, e in alg] + kirchhoff,
-            [e for _, e in updates],
             list(y.values()),
         )
     )
     arguments = [table.vector for table in (symbols.x, symbols.z, symbols.d, symbols.u, symbols.p)]
     dae = ca.Function(
         "dae",
-        [*arguments, symbols.h],
-        [ca.densify(e) for e in (f, mass, lower, upper, g, d_next, y_vector)],
-        ["x", "z", "d", "u", "p", "h"],
-        ["f", "mass", "lower", "upper", "g", "d_next", "y"],
+        arguments,
+        [ca.densify(e) for e in (f, mass, lower, upper, g, y_vector)],
+        ["x", "z", "d", "u", "p"],
+        ["f", "mass", "lower", "upper", "g", "y"],
     )
     return Model(
         system=system,
         dae=dae,
+        renew=_renewal(symbols, stated, omega_ref),
         x_names=tuple(symbols.x.names),
         z_names=tuple(symbols.z.names),
         d_names=tuple(symbols.d.names),
@@ -348,6 +352,20 @@ def assemble(system: System) -> Model:
         units=symbols.units | units,
         reference=reference,
     )
+
+
+def _renewal(symbols: Symbols, stated: Mapping[str, Stated], omega_ref: Expr) -> ca.Function:
+    """The discrete states after a step, from where it began and where it ended."""
+    x, z, d, u, p = (table.vector for table in (symbols.x, symbols.z, symbols.d, symbols.u, symbols.p))
+    x_0, z_0 = ca.SX.sym("x_0", x.numel()), ca.SX.sym("z_0", z.numel())
+    befores = [item for s in stated.values() for item in s.befores]
+    empty = ca.SX(0, 1)
+    updates = ca.vertcat(empty, *(e for s in stated.values() for _, e in s.updates))
+    at_start, signals = (ca.vertcat(empty, *(item[k] for item in befores)) for k in (0, 1))
+    updates, signals = ca.substitute([updates, signals], [symbols.omega_ref], [omega_ref])
+    signals = ca.substitute(signals, ca.vertcat(x, z), ca.vertcat(x_0, z_0))
+    updates = ca.densify(ca.substitute(updates, at_start, signals))
+    return ca.Function("renew", [x_0, z_0, x, z, d, u, p, symbols.h], [updates])
 
 
 def _reference(system: System, symbols: Symbols, stated: Mapping[str, Stated]) -> tuple[str, Expr]:

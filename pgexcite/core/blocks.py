@@ -138,6 +138,11 @@ def magnitude(re: Expr, im: Expr) -> Expr:
     return ca.sqrt(re * re + im * im + _TINY)
 
 
+def share_above(before: Expr, now: Expr) -> Expr:
+    """Share of a step, 0 to 1, that a signal on a straight line from ``before`` to ``now`` spends above zero."""
+    return (ca.fmax(before, 0) + ca.fmax(now, 0)) / ca.fmax(ca.fabs(before) + ca.fabs(now), _TINY)
+
+
 def quotient(numerator: Expr, denominator: Expr) -> Expr:
     """``numerator / denominator``, and 0 where the denominator is exactly zero (that block is switched off)."""
     off = ca.if_else(denominator == 0, 1.0, 0.0)

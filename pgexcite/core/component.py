@@ -22,7 +22,8 @@ class Equations:
         alg: residuals, zero at the solution; as many as the component declares algebraic unknowns.
         out: value of every declared output port.
         current: ``(i_re, i_im)`` injected into the bus, in per unit of the device's own base, for components with a terminal.
-        update: next value of every declared discrete state, evaluated once per step.
+        update: next value of every declared discrete state, evaluated at the end of each step.
+        before: for every signal declared with ``before`` what it is; ``update`` sees its value at the step's beginning.
         hold: value at the initial point of every declared constant, and of the set-points that the operating point leaves open.
     """
 
@@ -31,6 +32,7 @@ class Equations:
     out: Mapping[str, Expr] = field(default_factory=dict)
     current: tuple[Expr, Expr] | None = None
     update: Mapping[str, Expr] = field(default_factory=dict)
+    before: Mapping[str, Expr] = field(default_factory=dict)
     hold: Mapping[str, Expr] = field(default_factory=dict)
 
     def rows(self) -> tuple[Dynamics, ...]:

@@ -25,6 +25,7 @@ class Kind(Enum):
     OUTPUT = "output"
     SETPOINT = "setpoint"
     CONSTANT = "constant"
+    BEFORE = "before"
 
 
 class Variable:
@@ -117,6 +118,14 @@ def port_out(unit: str, description: str) -> Any:
 def setpoint(unit: str, description: str, guess: float = 0.0) -> Any:
     """Declare a set-point: a command the initialisation solves for and events or controllers change afterwards."""
     return Variable(Kind.SETPOINT, unit, description, guess=guess)
+
+
+def before(unit: str, description: str) -> Any:
+    """Declare a signal's value at the beginning of a step, after an event there; ``Equations.before`` gives the signal.
+
+    Only ``update`` may use it: with the value at the end of the step it tells where within the step a threshold was crossed.
+    """
+    return Variable(Kind.BEFORE, unit, description)
 
 
 def constant(unit: str, description: str, guess: float = 0.0) -> Any:

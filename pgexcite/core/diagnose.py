@@ -134,7 +134,7 @@ def _weakest_bus(model: Model, direction: Array) -> str:
 def _worst_equation(kernel: Kernel, state: State, p: Array, h: float) -> tuple[str, float]:
     """The row furthest from being satisfied by a step that stays at ``state``, and its residual; infinite where it has no value."""
     model = kernel.model
-    mass = np.array(model.dae(state.x, state.z, state.d, state.u, p, h)[1]).ravel()
+    mass = np.array(model.dae(state.x, state.z, state.d, state.u, p)[1]).ravel()
     w = np.concatenate((state.x, state.z))
     r = np.array(kernel.functions.residual(w, mass * state.x, h, state.d, state.u, p)[0]).ravel()
     r[~np.isfinite(r)] = np.inf

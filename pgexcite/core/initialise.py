@@ -76,7 +76,7 @@ def initialise(system: System) -> Initial:
 
 
 def _check_residual(model: Model, x: Array, z: Array, u: Array, p: Array) -> float:
-    f, _, _, _, g, _, _ = model.dae(x, z, model.d_0, u, p, 0.0)
+    f, _, _, _, g, _ = model.dae(x, z, model.d_0, u, p)
     residuals = np.abs(np.concatenate((np.array(f).ravel(), np.array(g).ravel())))
     names = (*model.x_names, *model.z_names)
     worst = float(residuals.max(initial=0.0))

@@ -178,7 +178,7 @@ def _derivatives(model: Model, state: State, p: Array) -> tuple[Array, Array, Ar
         for name, names in (("x", model.x_names), ("z", model.z_names), ("u", model.u_names))
     )
     d, q = ca.SX.sym("d", len(model.d_names)), ca.SX.sym("p", p.size)
-    f, mass, lower, upper, g, _, y = model.dae(x, z, d, u, q, 0.0)
+    f, mass, lower, upper, g, y = model.dae(x, z, d, u, q)
     point = ca.vertcat(x, z, u)
     # A bound that does not exist is infinite; its derivative is zero, not NaN.
     rows = {"f": f, "g": g, "y": y, "lower": lower, "upper": upper}

@@ -25,11 +25,12 @@ class Model:
     """The equations of a system as one CasADi function, with the names of everything in it.
 
         mass(p) x' = f(x, z, d, u, p)    lower <= x <= upper    0 = g(x, z, d, u, p)
-        d+ = update(x, z, d, u, p)       y = h(x, z, d, u, p)
+        d+ = renew(x_0, z_0, x, z, d, u, p, h)           y = h(x, z, d, u, p)
 
     Attributes:
         system: what was assembled.
-        dae: ``(x, z, d, u, p, h) -> (f, mass, lower, upper, g, d_next, y)``, all column vectors of the sizes of the names below.
+        dae: ``(x, z, d, u, p) -> (f, mass, lower, upper, g, y)``, all column vectors of the sizes of the names below.
+        renew: the discrete states after a step of ``h`` seconds from ``x_0, z_0`` (after an event there) to ``x, z``.
         x_names, z_names, d_names, u_names, p_names, y_names: paths of states, algebraic unknowns, discrete states, commands
             (set-points), parameters and outputs.
         p_0: parameters of the system as configured, shape ``(n_p,)``; constants of the initial point are NaN until initialised.
@@ -42,6 +43,7 @@ class Model:
 
     system: System
     dae: ca.Function
+    renew: ca.Function
     x_names: tuple[str, ...]
     z_names: tuple[str, ...]
     d_names: tuple[str, ...]
@@ -89,7 +91,7 @@ class Model:
     def fingerprint(self) -> str:
         """Hash of the equations and the names; a snapshot belongs to the model of the same fingerprint."""
         names = "\n".join((*self.x_names, *self.z_names, *self.d_names, *self.u_names, *self.p_names))
-        return hashlib.sha256((names + self.dae.serialize()).encode()).hexdigest()[:16]
+        return hashlib.sha256((names + self.dae.serialize() + self.renew.serialize()).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class StageFunctions:
             projected, those of algebraic rows zero. The slope depends on neither ``b`` nor ``c``.
         land: ``(w, b, q, d) -> (norm2, slope, y)``: the same with the outputs.
         residual: ``(w, b, c, d, u, p) -> (r, J)`` for the numeric solver.
-        update: ``(x, z, d, u, p, h) -> d_next``.
+        update: ``(w_0, w, d, u, p, h) -> d_next`` of a step from ``w_0`` to ``w``.
         pairing: equation each unknown is eliminated with.
         factors: of the linearised equations, in the symbols of the stage; ``None`` where they are not written out.
     """
@@ -122,7 +122,7 @@ def write_stage(model: Model) -> Stage:
     x, z = ca.SX.sym("x", n_x), ca.SX.sym("z", n_z)
     b, c = ca.SX.sym("b", n_x), ca.SX.sym("c")
     d, u, p = ca.SX.sym("d", len(model.d_names)), ca.SX.sym("u", len(model.u_names)), ca.SX.sym("p", len(model.p_names))
-    f, mass, lower, upper, g, _, y = model.dae(x, z, d, u, p, 0.0)
+    f, mass, lower, upper, g, y = model.dae(x, z, d, u, p)
     w = ca.vertcat(x, z)
     f, g = gather(f, w, [d, u, p]), gather(g, w, [d, u, p])
     rows, slopes, reaches = [], [], []
@@ -186,14 +186,15 @@ def build_stage_functions(model: Model, state: State, p: Array, stage: Stage) ->
     arguments, norm2 = [w, stage.b, hoisted.q], ca.sumsqr(r)
     iteration = [w - update, ca.vertcat(norm2, ca.sumsqr(update))]
     n_x, h = len(model.x_names), ca.SX.sym("h")
-    d_next = model.dae(w[:n_x], w[n_x:], stage.d, stage.u, stage.p, h)[5]
+    w_0 = ca.SX.sym("w_0", w.numel())
+    d_next = model.renew(w_0[:n_x], w_0[n_x:], w[:n_x], w[n_x:], stage.d, stage.u, stage.p, h)
     return StageFunctions(
         prepare=ca.Function("prepare", stage.parameters, [values, stage.mass, stage.reach], options),
         newton=None if factors is None else ca.Function("newton", arguments, iteration, options),
         check=ca.Function("check", arguments, [norm2, slope], options),
         land=ca.Function("land", [*arguments, stage.d], [norm2, slope, y], options),
         residual=residual,
-        update=ca.Function("update", [w[:n_x], w[n_x:], stage.d, stage.u, stage.p, h], [d_next]),
+        update=ca.Function("update", [w_0, w, stage.d, stage.u, stage.p, h], [d_next]),
         pairing=pairing,
         factors=factors,
     )

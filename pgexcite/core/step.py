@@ -114,7 +114,7 @@ class Kernel:
         self._prepared = [_Prepared(self) for _ in range(2)]
         self._with = self._prepared[0]
         functions = self.functions
-        self._update = bind(functions.update, [self.x, self.z, self.d, self.u, self.p, self._h], [self._d_next])
+        self._update = bind(functions.update, [self.start, self._here, self.d, self.u, self.p, self._h], [self._d_next])
         self._compiled = self._compile(compile)
 
     @property
@@ -369,12 +369,14 @@ class Kernel:
 
     def _subdivide(self, rule: Rule, h: float) -> bool:
         """The same step in shorter inner steps."""
-        x, z = self.x.copy(), self.z.copy()
+        before = self._here.copy()
         inner: Rule = "backward_euler" if rule == "trapezoidal" else rule
         for parts in SUBDIVISIONS:
-            if all(self.take(inner, h / parts, 0) for _ in range(parts)):
+            done = all(self.take(inner, h / parts, 0) for _ in range(parts))
+            self.start[:] = before
+            if done:
                 return True
-            self.x[:], self.z[:] = x, z
+            self._here[:] = before
         return False
 
     def settle_here(self) -> bool:

@@ -41,7 +41,7 @@ def disturbed(system, t=0.6):
 def differences(model, state, p, names, step=1e-6):
     """A, B, C, D by central differences: everything algebraic solved again at each of the shifted points."""
     reduced = Independent(model, state, p)
-    mass = np.array(model.dae(state.x, state.z, state.d, state.u, p, 0.0)[1]).ravel()
+    mass = np.array(model.dae(state.x, state.z, state.d, state.u, p)[1]).ravel()
     rows = [model.x_names.index(name) for name in names]
 
     def evaluate(x, u):

@@ -17,7 +17,7 @@ from pgexcite.core.declare import Kind
 
 Array = NDArray[np.float64]
 
-_OWN = (Kind.STATE, Kind.ALGEBRAIC, Kind.DISCRETE, Kind.SETPOINT, Kind.CONSTANT, Kind.INPUT)
+_OWN = (Kind.STATE, Kind.ALGEBRAIC, Kind.DISCRETE, Kind.SETPOINT, Kind.CONSTANT, Kind.INPUT, Kind.BEFORE)
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,7 @@ class Bench:
         self.base |= {
             item.name: item.default for item in cls.variables(Kind.INPUT, Kind.DISCRETE) if item.default is not None
         }
+        self.base |= {item.name: 0.0 for item in cls.variables(Kind.BEFORE)}
         own = [item.name for item in cls.variables(*_OWN)]
         around = ["omega_ref", "omega_0", "h", "S_n"] + (["v_re", "v_im"] if component.has_terminal else [])
         self.names = tuple(own + around)
@@ -67,6 +68,7 @@ class Bench:
         assert set(stated.out) == {item.name for item in cls.variables(Kind.OUTPUT)}
         assert set(stated.hold) == {item.name for item in cls.variables(Kind.CONSTANT)}
         assert set(stated.update) == {item.name for item in cls.variables(Kind.DISCRETE)}
+        assert set(stated.before) == {item.name for item in cls.variables(Kind.BEFORE)}
         assert len(stated.alg) == len(cls.variables(Kind.ALGEBRAIC))
         assert (stated.current is not None) == component.has_terminal
         self.outputs, self.holds, self.labels = (

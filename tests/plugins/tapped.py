@@ -9,8 +9,8 @@ from pgexcite.plugins.loads.zip import ConstantCurrent
 from pgexcite.plugins.sources.infinite_bus import InfiniteBus
 
 
-def plant(tap_changer, *, tap=1.0, V=1.02, P=40.0):
-    """A source, a line, a transformer whose tap changer holds the voltage of a load."""
+def plant(tap_changer, *, tap=1.0, V=1.02, P=40.0, load=None):
+    """A source, a line, a transformer whose tap changer holds the voltage of a load (of constant current, unless given)."""
     at = "LV" if tap_changer.regulates == "to" else "HV"
     return System(
         S_base=100.0,
@@ -21,7 +21,7 @@ def plant(tap_changer, *, tap=1.0, V=1.02, P=40.0):
         devices=(
             Device("transformer.T1", at, 100.0, {"tap_changer": tap_changer}, Schedule(P=0.0, Q=0.0)),
             Device("infinite_bus.grid", "INF", 100.0, {"": InfiniteBus()}, Schedule(V=V, angle=0.0)),
-            Device("load.L", "LV", 100.0, {"": ConstantCurrent(P=P)}, Schedule(P=-P, Q=0.0)),
+            Device("load.L", "LV", 100.0, {"": load or ConstantCurrent(P=P)}, Schedule(P=-P, Q=0.0)),
         ),
     )
 

@@ -249,7 +249,7 @@ def ordinary(simulation: Simulation) -> tuple[ca.SX, ca.SX, ca.SX, list[ca.SX]]:
     U[model.position("u", COMMAND)] = u
     P[model.position("p", FAULT)] = fault
     Z, d = ca.SX.sym("z", len(model.z_names)), ca.SX(state.d)
-    f, mass, _, _, g, _, y = model.dae(X, Z, d, U, P, 0.0)
+    f, mass, _, _, g, y = model.dae(X, Z, d, U, P)
     slope = ca.simplify(ca.jacobian(g, Z))
     assert not ca.depends_on(slope, Z), "the algebraic equations are not linear"
     solved = -ca.solve(slope, ca.substitute(g, Z, 0))

@@ -125,12 +125,13 @@ static int settle(Stage *s, double *x, double *z) {
     return 1;
 }
 
-/* Renews the discrete states. 0: nothing that matters to the equations; 1: the algebraic unknowns moved. */
+/* Renews the discrete states after a step from s->start. 0: nothing that matters to the equations; 1: the algebraic unknowns moved. */
 static int renew(Stage *s, double h, double *x, double *z, double *d) {
     static const int switching[] = SWITCHING;
     int i, changed = 0;
     double moved = 0;
-    args[0] = x; args[1] = z; args[2] = d; args[3] = s->u; args[4] = s->p; args[5] = &h;
+    memcpy(s->w[0], x, sizeof(double) * N_X); memcpy(s->w[0] + N_X, z, sizeof(double) * N_Z);
+    args[0] = s->start; args[1] = s->w[0]; args[2] = d; args[3] = s->u; args[4] = s->p; args[5] = &h;
     results[0] = s->d_next;
     update(args, results, iwork, work, 0);
     for (i = 0; i < N_D; i++) changed |= switching[i] && s->d_next[i] != d[i];

@@ -68,7 +68,12 @@ class OEL(TimedLimiter):
             drive = v.active * self.K_I * error - (1 - v.active) * v.x_i / self.T_TR
             integral = der(v.x_i, drive, lower=self.V_MIN, upper=ca.SX(0))
             v_oel = clip(v.x_i + v.active * self.K_P * error, self.V_MIN, ca.SX(0), "limiter's signal")
-        return Equations(ode=(sensed, integral), out={"v_oel": v_oel}, update=self.clock(v, sensed.y, self.I_LIM))
+        return Equations(
+            ode=(sensed, integral),
+            out={"v_oel": v_oel},
+            update=self.clock(v, sensed.y, self.I_LIM),
+            before={"current_before": sensed.y},
+        )
 
     def guess(self, terminal: Terminal | None, known: Mapping[str, float]) -> Mapping[str, float]:
         return {"i_m": known["i_fd"], "x_i": self.K_TR * known["e_fd"] if self.acts == "takeover" else 0.0}

@@ -56,7 +56,12 @@ class SCL(TimedLimiter):
         up = der(v.x_u, -under * self.K_I * error - (1 - under) * v.x_u / self.T_TR, lower=zero, upper=self.V_MAX)
         v_scl = _between(v.x_o + over * self.K_P * error, -self.V_MAX, 0.0)
         v_scl += _between(v.x_u - under * self.K_P * error, 0.0, self.V_MAX)
-        return Equations(ode=(down, up), out={"v_scl": v_scl}, update=self.clock(v, i_t, self.I_LIM))
+        return Equations(
+            ode=(down, up),
+            out={"v_scl": v_scl},
+            update=self.clock(v, i_t, self.I_LIM),
+            before={"current_before": i_t},
+        )
 
 
 def _between(signal: Expr, lower: Expr, upper: Expr) -> Expr:

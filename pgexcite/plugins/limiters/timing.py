@@ -6,8 +6,9 @@ from typing import Literal
 
 import casadi as ca
 
+from pgexcite.core.blocks import share_above
 from pgexcite.core.component import Signals
-from pgexcite.core.declare import Expr, discrete, par
+from pgexcite.core.declare import Expr, before, discrete, par
 from pgexcite.core.roles import Limiter
 
 _ROUNDING = 1e-6
@@ -22,10 +23,10 @@ class TimedLimiter(Limiter):
         timer >= T_LIM      ->  active = 1, the timer stays where it is
         active, and current < K_RESET limit for T_RESET  ->  active = 0, the timer cools down
 
-    The clock runs in the step's discrete map. It looks at the current at the end of each step and counts the whole step by it: a
-    delay is exact after an event, which moves the current at the step's beginning, and ends up to one step early where the current
-    crossed its threshold smoothly within a step. An overload that comes back before the timer has cooled down is tolerated for the
-    rest of ``T_LIM`` only.
+    The clock takes the current to run on a straight line from a step's beginning (after an event there) to its end. Of a step in
+    which it crosses a threshold each part counts as what it is; an inverse time is the trapezoidal integral. The limiter acts and
+    releases at the first end of a step not before it is due. An overload that comes back before the timer has cooled down is
+    tolerated for the rest of ``T_LIM`` only.
     """
 
     timing: Literal["fixed", "inverse"] = par("fixed", "-", "whether an overload's time depends on its size")
@@ -40,17 +41,27 @@ class TimedLimiter(Limiter):
     timer = discrete("s", "overload counted so far")
     below = discrete("s", "time spent below the release while active")
     active = discrete("-", "1 while the limiter acts")
+    current_before = before("pu", "current at the beginning of a step")
 
     def clock(self, v: Signals, current: Expr, limit: Expr) -> dict[str, Expr]:
-        """Next values of ``timer``, ``below`` and ``active``."""
-        pickup = self.K_PU * limit
+        """Next values of ``timer``, ``below`` and ``active``; the component hands ``current`` on as ``current_before``."""
+        pickup, release = self.K_PU * limit, self.K_RESET * limit
         over = current > pickup
-        speed: Expr = 1.0
-        if self.timing == "inverse":
-            speed = self.K_INV * (ca.exp(self.C * ca.log(ca.fmax(current / pickup, 1.0))) - 1)
-        counted = v.timer + v.h * ca.if_else(over, speed, -self.K_COOL)
-        timer = ca.if_else(v.active, v.timer, ca.fmin(ca.fmax(counted, 0.0), self.T_LIM))
-        below = v.active * (current < self.K_RESET * limit) * (v.below + v.h)
+        share = share_above(v.current_before - pickup, current - pickup)
+        heated = v.h * share * (self._speed(v.current_before / pickup) + self._speed(current / pickup)) / 2
+        cooled = v.h * (1 - share) * self.K_COOL
+        rising, falling = ca.fmax(v.timer - cooled, 0) + heated, ca.fmax(v.timer + heated - cooled, 0)
+        timer = ca.if_else(v.active, v.timer, ca.fmin(ca.if_else(over, rising, falling), self.T_LIM))
+        spent = (v.current_before < release) * v.below + v.h * share_above(
+            release - v.current_before, release - current
+        )
+        below = v.active * (current < release) * spent
         released = v.active * (below >= self.T_RESET - _ROUNDING) * (below > 0)
         due = (1 - v.active) * over * (timer >= self.T_LIM - _ROUNDING)
         return {"timer": timer, "below": (1 - released) * below, "active": due + v.active * (1 - released)}
+
+    def _speed(self, overload: Expr) -> Expr:
+        """Speed of the timer at an overload (current over pick-up); at and below pick-up that of an overload just beginning."""
+        if self.timing == "fixed":
+            return ca.SX(1)
+        return self.K_INV * (ca.exp(self.C * ca.log(ca.fmax(overload, 1.0))) - 1)

@@ -6,9 +6,9 @@ from typing import ClassVar
 
 import casadi as ca
 
-from pgexcite.core.blocks import magnitude
+from pgexcite.core.blocks import magnitude, share_above
 from pgexcite.core.component import Equations, Signals
-from pgexcite.core.declare import discrete, par
+from pgexcite.core.declare import before, discrete, par
 from pgexcite.core.roles import TapChanger
 
 _ROUNDING = 1e-6
@@ -24,11 +24,13 @@ class OLTC(TapChanger):
 
         ratio = tap + step * position,  kept within tap_min .. tap_max
 
-    The timer starts when the voltage leaves the dead band and is reset when it returns, when it crosses to the other side, and by a
-    tap. It looks at the voltage at the end of each step and counts the whole step if the voltage is outside then: a delay is exact
-    after an event, which moves the voltage at the step's beginning, and ends up to one step early where the voltage slid out of the
-    dead band within a step. With the bus at the receiving end a high voltage raises the ratio; at the sending end it lowers it.
-    Position 0 is the transformer's own ``tap``.
+    The timer starts when the voltage leaves the dead band and is reset when it returns and when it crosses to the other side. Of
+    the step in which the voltage leaves the dead band the part outside counts, by a straight line between the step's beginning
+    (after an event there) and its end. A tap is made at the first end of a step not before it is due; the time by which it comes
+    late counts for the next one, so that taps keep their pace on any step up to the delay.
+
+    With the bus at the receiving end a high voltage raises the ratio; at the sending end it lowers it. Position 0 is the
+    transformer's own ``tap``.
 
     Not modelled: the voltage transducer, delays that shorten with the deviation, the time a tap takes.
     """
@@ -49,18 +51,20 @@ class OLTC(TapChanger):
     blocked: float = par(0.0, "-", "1 while the automaton is blocked, which also resets its timer", ge=0, le=1)
 
     position = discrete("-", "taps away from the initial ratio")
-    timer = discrete("s", "time the voltage has been outside its dead band since the last tap")
+    timer = discrete("s", "time the voltage has been outside its dead band since the last tap was due")
     side = discrete("-", "side of the dead band the voltage is on: -1, 0 or 1")
     repeated = discrete("-", "1 once a tap has been made on this side")
+
+    error_before = before("pu", "deviation of the voltage at the beginning of a step")
 
     def equations(self, v: Signals) -> Equations:
         error = magnitude(v.v_re, v.v_im) - self.V_ref
         outside = (error > self.half_deadband) - (error < -self.half_deadband)
         side = (1 - self.blocked) * outside
-        stays = (side != 0) * (side == v.side)
+        beyond_before, beyond = (side * e - self.half_deadband for e in (v.error_before, error))
+        stays = (side != 0) * (side == v.side) * (beyond_before > 0)
         repeated = stays * v.repeated
-        # The step just taken counts in full: whether an event at its beginning moved the voltage cannot be seen from its end.
-        timer = stays * v.timer + (side != 0) * v.h
+        timer = stays * v.timer + (side != 0) * share_above(beyond_before, beyond) * v.h
         delay = ca.if_else(repeated, self.T_next, self.T_first)
         due = timer >= delay - _ROUNDING
         wanted = v.position + self._direction * side
@@ -72,8 +76,9 @@ class OLTC(TapChanger):
             current=(ca.SX(0), ca.SX(0)),
             update={
                 "position": ca.if_else(taps, wanted, v.position),
-                "timer": ca.if_else(taps, 0.0, ca.if_else(due, delay, timer)),
+                "timer": ca.if_else(taps, ca.fmin(timer - delay, self.T_next), ca.if_else(due, delay, timer)),
                 "side": side,
                 "repeated": ca.if_else(taps, 1.0, repeated),
             },
+            before={"error_before": error},
         )

@@ -100,7 +100,7 @@ def ipopt_plan(sim, problem, u_last):
             *[U[min(j, problem.N_c - 1)] if i == k else float(sim.state.u[i]) for i in range(sim.state.u.size)]
         )
         for _ in range(round(problem.dt / H)):
-            f0, mass = model.dae(x, z, model.d_0, u, sim.p, 0.0)[:2]
+            f0, mass = model.dae(x, z, model.d_0, u, sim.p)[:2]
             guess = sim.kernel.advance(guess, sim.p, "tr_bdf2", H, 1).state
             stages = []
             for _ in range(2):
@@ -109,11 +109,11 @@ def ipopt_plan(sim, problem, u_last):
                 start += [*guess.x, *guess.z]
                 stages.append((xs, zs))
             (xm, zm), (x1, z1) = stages
-            fm, _, _, _, gm, *_ = model.dae(xm, zm, model.d_0, u, sim.p, 0.0)
-            f1, _, _, _, g1, *_ = model.dae(x1, z1, model.d_0, u, sim.p, 0.0)
+            fm, _, _, _, gm, *_ = model.dae(xm, zm, model.d_0, u, sim.p)
+            f1, _, _, _, g1, *_ = model.dae(x1, z1, model.d_0, u, sim.p)
             equalities += [mass * (xm - x) - c * (f0 + fm), gm, mass * (x1 - alpha * xm + beta * x) - c * f1, g1]
             x, z = x1, z1
-        y = model.dae(x, z, model.d_0, u, sim.p, 0.0)[6]
+        y = model.dae(x, z, model.d_0, u, sim.p)[5]
         cost += problem.Q[0] * (1.0 - y[iv]) ** 2 + problem.P[0] * (1 - y[iw]) ** 2
     last = u_last[0]
     for move in U:
