@@ -88,12 +88,12 @@ def der(x: Expr, rhs: Expr, T: Expr = 1.0, lower: Expr | None = None, upper: Exp
 
 
 def lag(u: Expr, x: Expr, *, T: Expr, K: Expr = 1.0, lower: Expr | None = None, upper: Expr | None = None) -> Block:
-    """``K / (1 + sT)``; with bounds, the non-windup form of IEEE 421.5 figure E.3. With ``T = 0`` it is ``clip(K u)``."""
+    """``K / (1 + sT)``; with bounds, the non-windup form of IEEE 421.5 annex E. With ``T = 0`` it is ``clip(K u)``."""
     return Block(x, Dynamics(x, K * u - x, T, lower, upper))
 
 
 def integrator(u: Expr, x: Expr, *, T: Expr = 1.0, lower: Expr | None = None, upper: Expr | None = None) -> Block:
-    """``1 / (sT)`` with ``T > 0``; with bounds, the non-windup form of IEEE 421.5 figure E.1."""
+    """``1 / (sT)`` with ``T > 0``; with bounds, the non-windup form of IEEE 421.5 annex E."""
     return Block(x, Dynamics(x, u, T, lower, upper))
 
 

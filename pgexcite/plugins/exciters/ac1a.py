@@ -35,7 +35,7 @@ class AC1A(Exciter):
     """
 
     source: ClassVar[str] = (
-        "IEEE Std 421.5-2005, figure 6 and annex D; Siemens PTI, PSS/E Program Application Guide volume II, model ESAC1A"
+        "IEEE Std 421.5-2005, clause 6.1 (AC1A) and annex D; Siemens PTI, PSS/E Program Application Guide volume II, model ESAC1A"
     )
     ordered = (("V_AMIN", "V_AMAX"), ("V_RMIN", "V_RMAX"))
     proper = (("T_C", "T_B"), ("K_F", "T_F"))

@@ -30,7 +30,7 @@ class DC1A(Exciter):
     Not modelled: high-value gate of an underexcitation limiter; supply from the terminals (DC2A); effect of speed on the exciter.
     """
 
-    source: ClassVar[str] = "IEEE Std 421.5-2005, figure 3 and clause 5.1"
+    source: ClassVar[str] = "IEEE Std 421.5-2005, clause 5.1 (DC1A)"
     ordered = (("V_RMIN", "V_RMAX"),)
     proper = (("T_C", "T_B"), ("K_F", "T_F"))
 

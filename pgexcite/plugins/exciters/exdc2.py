@@ -33,7 +33,7 @@ class EXDC2(Exciter):
     """
 
     source: ClassVar[str] = (
-        "Siemens PTI, PSS/E Program Application Guide volume II, model EXDC2; IEEE Std 421.5-2005, figure 4"
+        "Siemens PTI, PSS/E Program Application Guide volume II, model EXDC2; IEEE Std 421.5-2005, clause 5.2 (DC2A)"
     )
     ordered = (("V_RMIN", "V_RMAX"),)
     proper = (("T_C", "T_B"), ("K_F", "T_F1"))

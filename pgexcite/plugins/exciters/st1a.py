@@ -1,4 +1,4 @@
-"""IEEE ST1A potential-source controlled-rectifier excitation system (IEEE Std 421.5-2005, figure 12)."""
+"""IEEE ST1A potential-source controlled-rectifier excitation system (IEEE Std 421.5-2005, clause 7.1)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ST1A(Exciter):
             |                    max(0, K_LR (i_fd - I_LR)) ---(-)  v_s (pss_position 2) --(+)                         |
             +----------------------------------------------------------------------------------------------------------+
 
-    At (2) and (3) stand a high-value gate with ``v_uel`` and then a low-value gate with ``v_oel``. Figure 12 has the overexcitation
+    At (2) and (3) stand a high-value gate with ``v_uel`` and then a low-value gate with ``v_oel``. The 2005 edition has the overexcitation
     limiter at the output only; its other positions are those of ST1C in the 2016 edition. A position other than 0 wants a limiter
     in the unit: without one a gate never acts, and a sum is far off. The limits of the regulator do not wind up, those of the
     rectifier do. A time constant of zero takes its block out.
@@ -41,7 +41,7 @@ class ST1A(Exciter):
     Not modelled: rectifier regulation other than ``K_C``; load compensation.
     """
 
-    source: ClassVar[str] = "IEEE Std 421.5-2005, figure 12 and clause 7.1"
+    source: ClassVar[str] = "IEEE Std 421.5-2005, clause 7.1 (ST1A)"
     ordered = (("V_IMIN", "V_IMAX"), ("V_AMIN", "V_AMAX"), ("V_RMIN", "V_RMAX"))
     proper = (("T_C", "T_B"), ("T_C1", "T_B1"), ("K_F", "T_F"))
 

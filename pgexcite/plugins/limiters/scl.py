@@ -26,10 +26,15 @@ class SCL(TimedLimiter):
     Between ``-Q_DB`` and ``Q_DB`` the action fades out: there the current is active power, which the field cannot change. What acts
     no more decays with ``T_TR``. Timing as in ``TimedLimiter``.
 
-    Not modelled: SCL1C's separate settings of the two sides, lead-lags, SCL2C's takeover.
+    Of SCL1C there are the limit (``I_LIM`` is its ``I_SCLlim``, 1.05 in its samples), a PI regulator for each side and the dead
+    band of reactive power (``Q_DB`` is its ``V_SCLdb``, 0.1 in its samples). Ours are: the dead band as a ramp from 0 to ``Q_DB``,
+    in place of a switch at it; the timer; decay with ``T_TR``; the defaults of the gains and of ``V_MAX`` (samples: 0.03 to 1
+    and 0.2 to 1).
+
+    Not modelled: SCL1C's separate settings of the two sides and its transducers, SCL2C's takeover.
     """
 
-    source: ClassVar[str] = "IEEE Std 421.5-2016, clause 12 (SCL1C), reduced"
+    source: ClassVar[str] = "IEEE Std 421.5-2016, model SCL1C, reduced"
 
     I_LIM: float = par(1.05, "pu", "stator current the limiter brings it down to", gt=0)
     K_P: float = par(0.05, "pu", "proportional gain", ge=0)

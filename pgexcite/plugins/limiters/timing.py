@@ -27,6 +27,12 @@ class TimedLimiter(Limiter):
     which it crosses a threshold each part counts as what it is; an inverse time is the trapezoidal integral. The limiter acts and
     releases at the first end of a step not before it is due. An overload that comes back before the timer has cooled down is
     tolerated for the rest of ``T_LIM`` only.
+
+    The inverse time is that of OEL2C (IEEE Std 421.5-2016): ``K_INV``, ``C``, ``T_LIM``, ``T_RESET`` and ``K_PU limit`` are its
+    ``K_2``, ``c_2``, ``T_FCL``, ``T_off`` and ``I_TFPU``, and the defaults of the first four those of its sample sets (0.296, 2,
+    10 s, 5 s). The rest is ours: one latch in place of a reference that ramps between an instantaneous and a thermal limit;
+    cooling at ``K_COOL`` s/s (OEL2C's fixed rate ``FIXED_RD``; ``K_CD`` of the 2005 edition's limiter is 1, too); release below
+    ``K_RESET limit`` (OEL2C lets go at a current ``I_THOFF`` below its reference, once its timer has cooled down).
     """
 
     timing: Literal["fixed", "inverse"] = par("fixed", "-", "whether an overload's time depends on its size")

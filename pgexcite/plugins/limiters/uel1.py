@@ -32,7 +32,7 @@ class UEL1(Limiter):
     Not modelled: the excitation system's stabiliser signal (``K_UF``).
     """
 
-    source: ClassVar[str] = "IEEE Std 421.5-2016, clause 11.1 and figure 34 (UEL1)"
+    source: ClassVar[str] = "IEEE Std 421.5-2005, clause 10.1 (UEL1), kept in the 2016 edition"
     ordered = (("V_UIMIN", "V_UIMAX"),)
     proper = (("T_U1", "T_U2"), ("T_U3", "T_U4"))
 

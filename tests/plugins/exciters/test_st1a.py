@@ -128,7 +128,7 @@ def test_rectifier_ceiling_winds_up_behind_the_regulator():
     _, run = respond(exciter, lambda t: {"v_t": 1.0 - 0.5 * (0.1 <= t < 0.3)}, t_end=0.4)
     assert run["v_a"][300] > 6.4 > run["e_fd"][299]
     assert run["e_fd"][299] == pytest.approx(3.2)
-    # Still at the ceiling after the dip: it winds up, as figure 12 has it.
+    # Still at the ceiling after the dip: it winds up, as in the standard.
     assert run["e_fd"][320] == pytest.approx(6.4)
 
 
