@@ -31,10 +31,10 @@ class ST1A(Exciter):
             |                    max(0, K_LR (i_fd - I_LR)) ---(-)  v_s (pss_position 2) --(+)                         |
             +----------------------------------------------------------------------------------------------------------+
 
-    At (2) and (3) stand a high-value gate with ``v_uel`` and then a low-value gate with ``v_oel``. The 2005 edition has the overexcitation
-    limiter at the output only; its other positions are those of ST1C in the 2016 edition. A position other than 0 wants a limiter
-    in the unit: without one a gate never acts, and a sum is far off. The limits of the regulator do not wind up, those of the
-    rectifier do. A time constant of zero takes its block out.
+    At (2) and (3) stand a high-value gate with ``v_uel`` and then a low-value gate with ``v_oel``. The 2005 edition has the
+    overexcitation limiter at the output only; its other positions are those of ST1C in the 2016 edition. A position other than 0
+    wants a limiter in the unit: without one a gate never acts, and a sum is far off. The limits of the regulator do not wind up,
+    those of the rectifier do. A time constant of zero takes its block out.
 
     Defaults: Kundur's thyristor exciter; the limits of the error and of the regulator are out of reach.
 

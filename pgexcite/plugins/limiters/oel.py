@@ -31,9 +31,9 @@ class OEL(TimedLimiter):
       release it decays with ``T_TR``. The gains are those of the field voltage over ``K_A``.
 
     Currents are on the air-gap-line base. Timing as in ``TimedLimiter``. Of OEL2C there are the transducer (``T_F`` is its
-    ``T_R``), the inverse time and the PI regulator with its limits (+-10 pu in its samples, too). ``K_TR``, ``T_TR`` and the way the integrator
-    follows are ours, and so are the defaults of ``K_P`` and ``K_I``: OEL2C's samples are proportional only where they take over
-    (0.5 at the regulator's input, 500 at its output) and 0.3 + 1/s at the sum.
+    ``T_R``), the inverse time and the PI regulator with its limits (+-10 pu in its samples, too). ``K_TR``, ``T_TR`` and the way
+    the integrator follows are ours, and so are the defaults of ``K_P`` and ``K_I``: OEL2C's samples are proportional only where
+    they take over (0.5 at the regulator's input, 500 at its output) and 0.3 + 1/s at the sum.
 
     Not modelled: OEL2C's instantaneous limit (ST1A has ``K_LR``), ramps and filter of its reference, differential action,
     lead-lags.
