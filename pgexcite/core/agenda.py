@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pgexcite.core.errors import Problem
 from pgexcite.core.events import Change, boundary
+from pgexcite.core.memory import those_under, under
 from pgexcite.core.model import Model
 from pgexcite.core.triggers import Triggers
 
@@ -58,13 +59,11 @@ class Agenda:
         """What it goes on from at step boundary ``k``."""
         taken = sum(self._boundary(change) == k for change in self.changes)
         taken -= sum(self._boundary(change) == k for change in self._pending)
-        waiting = {f"trigger:{key}": value for key, value in self._triggers.memory().items()}
-        return {"applied_here": np.array(taken), **waiting}
+        return {"applied_here": np.array(taken), **under("trigger", self._triggers.memory())}
 
     def recall(self, memory: Mapping[str, Array], k: int) -> None:
         """Take up where ``memory(k)`` left off; what happens before that is taken as past."""
-        start = "trigger:"
-        self._triggers.recall({key.removeprefix(start): v for key, v in memory.items() if key.startswith(start)})
+        self._triggers.recall(those_under("trigger", memory))
         self.changes = _in_order([*self._timed, *self._triggers.past()])
         here = [change for change in self.changes if self._boundary(change) == k]
         later = [change for change in self.changes if self._boundary(change) > k]

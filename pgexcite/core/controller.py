@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,8 +154,3 @@ class Controller(Protocol):
     def start(self, surroundings: Surroundings, plant: Plant | None) -> Session:
         """Begin a run; ``plant`` is ``None`` unless it has perfect information."""
         ...
-
-
-def as_arrays(values: Mapping[str, Any]) -> dict[str, Array]:
-    """Numbers and sequences as float arrays, for ``Session.memory``."""
-    return {key: np.asarray(value, dtype=float) for key, value in values.items()}

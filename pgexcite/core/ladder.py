@@ -23,7 +23,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.controller import Action, Sample, as_arrays
+from pgexcite.core.controller import Action, Sample
+from pgexcite.core.memory import as_arrays, those_under, under
 from pgexcite.core.mpc import Problem, Solution, Solver, Status
 
 Array = NDArray[np.float64]
@@ -159,7 +160,7 @@ class Ladder:
             "home",
         )
         own = as_arrays({name: getattr(self, f"_{name}") for name in names})
-        return own | {f"solver:{key}": value for key, value in self.solver.memory().items()}
+        return own | under("solver", self.solver.memory())
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
@@ -168,8 +169,7 @@ class Ladder:
         self._reused, self._stale, self._good = (int(memory[name]) for name in ("reused", "stale", "good"))
         flags = ("in_charge", "stepped_down", "returning")
         self._in_charge, self._stepped_down, self._returning = (bool(memory[name] > 0) for name in flags)
-        start = "solver:"
-        self.solver.recall({key.removeprefix(start): value for key, value in memory.items() if key.startswith(start)})
+        self.solver.recall(those_under("solver", memory))
 
     # Before the plan.
 

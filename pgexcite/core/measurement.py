@@ -27,6 +27,11 @@ class Measurement(BaseModel):
     loss: float = par(0.0, "-", "probability that a sample is lost; the controller is then told NaN", ge=0, lt=1)
     seed: int = Field(default=1, description="seed of noise and losses", ge=0)
 
+    @property
+    def random(self) -> bool:
+        """Whether what is told depends on the seed."""
+        return self.noise > 0 or self.noise_omega > 0 or self.loss > 0
+
 
 class Instruments:
     """The measurements of one controller in one run.

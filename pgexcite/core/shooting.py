@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pgexcite.core.condensed import Condensed, Curvature, Direction, Linearised
 from pgexcite.core.controller import Sample
 from pgexcite.core.horizons import Horizons
+from pgexcite.core.memory import those_under, under
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem, Solution, Status
 from pgexcite.core.prediction import Horizon, Predictor, Rollout
@@ -163,7 +164,7 @@ class Shooting(ABC):
         if self._plan is not None:
             kept["plan"] = self._plan
         if self._prepared is not None:
-            kept |= {f"prepared:{name}": value for name, value in self._prepared.arrays().items()}
+            kept |= under("prepared", self._prepared.arrays())
         if isinstance(solver := self.condensed.solver, WarmSolver):
             kept["multipliers"] = solver.memory()
         return kept
@@ -171,8 +172,7 @@ class Shooting(ABC):
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
         self._plan = memory.get("plan")
-        start = "prepared:"
-        prepared = {key.removeprefix(start): value for key, value in memory.items() if key.startswith(start)}
+        prepared = those_under("prepared", memory)
         self._ready(_Prepared(**prepared) if prepared else None)
         if isinstance(solver := self.condensed.solver, WarmSolver):
             solver.recall(memory["multipliers"])

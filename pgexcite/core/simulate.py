@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from pgexcite.core.events import Change
 from pgexcite.core.history import History
 from pgexcite.core.initialise import Initial, initialise
 from pgexcite.core.measurement import Instruments
+from pgexcite.core.memory import Memory, as_arrays, those_under, under
 from pgexcite.core.model import Model, State
 from pgexcite.core.result import RunResult
 from pgexcite.core.settings import Settings
@@ -157,6 +159,11 @@ class Simulation:
             self.outcome = Outcome(Ending.COMPLETED, self.state.t, "", f"completed at t = {self.state.t:g} s")
         assert self.outcome is not None
         return self.outcome
+
+    @property
+    def controllers(self) -> Mapping[str, Controller]:
+        """The controllers as configured, by name."""
+        return self._controllers
 
     @property
     def sessions(self) -> Mapping[str, Session]:
@@ -314,39 +321,66 @@ class Simulation:
         system, statistics = self.model.system, self._history.statistics()
         return RunResult(title, config or {}, system, outcome, self.trace(), self.state.k, self.wall_time, statistics)
 
-    # Snapshots.
+    # What it remembers.
+
+    def memory(self) -> Memory:
+        """All that it goes on from."""
+        kept = {"low": self._low.elapsed, **self._agenda.memory(self.state.k)}
+        for name, running in self._running.items():
+            kept |= under(f"controller:{name}", running.session.memory())
+            kept[f"instruments:{name}"] = running.instruments.memory()
+            kept |= as_arrays({f"active:{name}": running.active, f"ordered:{name}": running.ordered})
+        return Memory(self.state, self.p.copy(), {key: np.array(value) for key, value in kept.items()})
+
+    def recall(self, memory: Memory) -> None:
+        """Go on from where ``memory`` was taken, bit for bit; what was recorded and how the run ended stay as they are.
+
+        Raises:
+            KeyError: it was taken of other controllers.
+        """
+        kept = {key: value.copy() for key, value in memory.kept.items()}
+        self.state, self.p = memory.state, memory.p.copy()
+        for name, running in self._running.items():
+            running.instruments.recall(kept[f"instruments:{name}"])
+            running.session.recall(those_under(f"controller:{name}", kept))
+            running.active, running.ordered = bool(kept[f"active:{name}"]), bool(kept[f"ordered:{name}"])
+        self._agenda.recall(kept, self.state.k)
+        self._low.elapsed = kept["low"]
+
+    @contextmanager
+    def tentatively(self) -> Iterator[None]:
+        """What is done inside is undone at its end: nothing is left of it, in what is remembered or in what is recorded."""
+        memory, left = self.memory(), (self._history, self.outcome, self.wall_time, self.controlled)
+        self._record_anew()
+        try:
+            yield
+        finally:
+            self.recall(memory)
+            self._history, self.outcome, self.wall_time, self.controlled = left
+
+    def _record_anew(self) -> None:
+        self._history = History(self.model, self._running)
+        self._record_point()
 
     def save(self, path: Path) -> None:
-        """Write the present point, parameters and the controllers' memories; ``resume`` goes on from it bit for bit."""
-        memory = {
-            f"controller:{name}:{key}": value
-            for name, r in self._running.items()
-            for key, value in r.session.memory().items()
-        }
-        for name, r in self._running.items():
-            memory[f"instruments:{name}"] = r.instruments.memory()
-            memory[f"active:{name}"] = np.array(float(r.active))
-        memory["low"] = self._low.elapsed
-        memory |= self._agenda.memory(self.state.k)
-        self.state.save(path, self.model, self.p, memory)
+        """Write what it remembers; ``resume`` goes on from it bit for bit."""
+        memory = self.memory()
+        memory.state.save(path, self.model, memory.p, memory.kept)
 
     def resume(self, path: Path) -> None:
         """Go on from a saved point; events before it are taken as past.
 
         Raises:
-            SnapshotError: the file cannot be read or belongs to another model.
+            SnapshotError: the file cannot be read or belongs to another model or to other controllers.
         """
         self.restart()
-        self.state, self.p, memory = State.load(path, self.model)
+        memory = Memory(*State.load(path, self.model))
         for name, running in self._running.items():
-            start = f"controller:{name}:"
-            own = {key[len(start) :]: value for key, value in memory.items() if key.startswith(start)}
-            if not own and running.session.memory():
+            if running.session.memory() and not those_under(f"controller:{name}", memory.kept):
                 raise SnapshotError(f"{path}: holds nothing of the controller {name!r}")
-            running.session.recall(own)
-            running.instruments.recall(memory[f"instruments:{name}"])
-            running.active = bool(memory[f"active:{name}"] > 0)
-        self._agenda.recall(memory, self.state.k)
-        self._low.elapsed = memory["low"].copy()
-        self._history = History(self.model, self._running)
-        self._record_point()
+        try:
+            self.recall(memory)
+        except KeyError as missing:
+            text = f"holds no {missing}; use the configuration and the version it was taken with"
+            raise SnapshotError(f"{path}: {text}") from missing
+        self._record_anew()

@@ -8,8 +8,8 @@ numerically, so it is of the very controllers that run: quadratic programs witho
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,6 @@ from scipy.linalg import eig
 
 from pgexcite.core.errors import PgexciteError
 from pgexcite.core.linearise import Mode, linearise, modes_of
-from pgexcite.core.model import State
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.trace import Ending
 
@@ -29,8 +28,6 @@ CARRIED = ("u", "solver:u", "solver:filter:x")
 
 The rest stays as it is at rest. A filter's covariance does not depend on what is measured, and while it does not the innovations
 are zero: its gain has no first-order effect. A quadratic program's solution does not depend on the plan it starts from."""
-_UNDER_WAY = "instruments"
-"""Name given to the delayed samples of a controller's measurements, which carry the past on as well."""
 _FORGOTTEN = 1e-6
 """Multipliers below this are gone after a sample; their logarithm says nothing."""
 
@@ -75,7 +72,7 @@ def sampled_modes(
     """Differentiate the map over a sample around the point where a simulation stands, by central differences.
 
     The simulation must be at rest, controllers included (run it undisturbed until estimates have settled), with no event due within
-    the sample; it is left where it was. Controllers are held to be deterministic: without noise, without losses.
+    the sample; it is left as it was, to the last bit.
 
     Args:
         simulation: at a sampling instant, before the controllers act.
@@ -85,8 +82,12 @@ def sampled_modes(
 
     Raises:
         PgexciteError: the simulation is not at a sampling instant, is not at rest, or does not get over the sample; delayed
-            measurements have not yet been taken.
+            measurements have not yet been taken; measurements are noisy or may be lost, so that there is no one map.
     """
+    for name, controller in simulation.controllers.items():
+        if controller.measurement.random:
+            text = "its noise and losses make every sample another map; leave them out"
+            raise PgexciteError(f"controller.{name}.measurement: {text}")
     loop = _Loop(simulation, period, carried)
     rest = loop.read()
     defect = float(np.abs(loop(rest) - rest).max(initial=0.0))
@@ -97,77 +98,54 @@ def sampled_modes(
         move = np.zeros(rest.size)
         move[k] = size
         columns.append((loop(rest + move) - loop(rest - move)) / (2 * size))
-    loop.restore()
     return SampledLoop(np.array(columns).T.reshape(rest.size, rest.size), loop.names, period, defect)
 
 
 class _Loop:
-    """The map over a sample, from a vector to a vector; calling it moves the simulation."""
+    """The map over a sample, from a vector to a vector; each call leaves the simulation where it was."""
 
     def __init__(self, simulation: Simulation, period: float, carried: Sequence[str]) -> None:
         self._sim, self._period = simulation, period
-        self._start: State = simulation.state
+        self._rest = simulation.memory()
         count, every = round(period / simulation.settings.h), simulation.sampling
-        if every and (self._start.k % every or count % every):
+        if every and (simulation.state.k % every or count % every):
             text = f"start and length of the sample must be multiples of the controllers' {every * simulation.settings.h:g} s"
             raise PgexciteError(text)
         model = simulation.model
-        moving = linearise(model, self._start, simulation.p).x_names
+        moving = linearise(model, simulation.state, simulation.p).x_names
         self._moving = np.array([model.position("x", path) for path in moving], dtype=int)
-        self._memory = self._kept()
-        carried = (*carried, _UNDER_WAY)
-        self._entries = [(name, key) for name, kept in self._memory.items() for key in carried if key in kept]
-        own = [
-            f"controller.{name}.{key}.{k}" for name, key in self._entries for k in range(self._memory[name][key].size)
-        ]
-        self.names = (*moving, *own)
-
-    def _kept(self) -> dict[str, dict[str, Array]]:
-        """What each controller and its instruments remember now."""
-        instruments = self._sim.instruments
-        return {
-            name: {**session.memory(), _UNDER_WAY: instruments[name].memory()}
-            for name, session in self._sim.sessions.items()
-        }
+        kept, said = self._rest.kept, dict[str, str]()
+        for name in simulation.controllers:
+            said |= {f"controller:{name}:{key}": f"controller.{name}.{key}" for key in carried}
+            # Delayed samples of its measurements carry the past on as well.
+            said[f"instruments:{name}"] = f"controller.{name}.instruments"
+        self._entries = [key for key in said if key in kept]
+        self.names = (*moving, *(f"{said[key]}.{k}" for key in self._entries for k in range(kept[key].size)))
 
     def read(self) -> Array:
         """What the simulation carries on now."""
-        kept = self._kept()
-        if any(kept[name][_UNDER_WAY].shape != self._memory[name][_UNDER_WAY].shape for name in kept):
+        kept = self._sim.memory().kept
+        if any(kept[key].shape != self._rest.kept[key].shape for key in self._entries):
             raise PgexciteError("delayed measurements have not yet been taken: run the simulation for a sample or more")
-        return np.concatenate(
-            (self._sim.state.x[self._moving], *(np.ravel(kept[name][key]) for name, key in self._entries))
-        )
+        return np.concatenate((self._sim.state.x[self._moving], *(np.ravel(kept[key]) for key in self._entries)))
 
     def __call__(self, vector: Array) -> Array:
         """A sample on from ``vector``."""
-        x = self._start.x.copy()
+        start = self._rest.state
+        x = start.x.copy()
         x[self._moving] = vector[: self._moving.size]
-        settled = self._sim.kernel.settle(self._start.with_(x=x), self._sim.p)
+        settled = self._sim.kernel.settle(start.with_(x=x), self._sim.p)
         if settled is None:
             raise PgexciteError("the network has no solution next to this point")
         # Solving the network again is not a discontinuity that the loop would have met.
-        settled = settled.with_(startup=self._start.startup)
-        memory = {name: dict(kept) for name, kept in self._memory.items()}
-        at = self._moving.size
-        for name, key in self._entries:
-            shape = memory[name][key].shape
-            memory[name][key] = vector[at : at + memory[name][key].size].reshape(shape)
-            at += memory[name][key].size
-        self._place(settled, memory)
-        outcome = self._sim.run(until=self._start.t + self._period)
-        if outcome.ending is not Ending.COMPLETED:
-            raise PgexciteError(f"the simulation did not get over the sample: {outcome.message}")
-        self._sim.forget(np.inf)
-        return self.read()
-
-    def restore(self) -> None:
-        """Put the simulation back to where it was."""
-        self._place(self._start, self._memory)
-
-    def _place(self, state: State, memory: Mapping[str, Mapping[str, Array]]) -> None:
-        self._sim.state = state
-        for name, session in self._sim.sessions.items():
-            kept = dict(memory[name])
-            self._sim.instruments[name].recall(kept.pop(_UNDER_WAY))
-            session.recall(kept)
+        settled = settled.with_(startup=start.startup)
+        kept, at = dict(self._rest.kept), self._moving.size
+        for key in self._entries:
+            kept[key] = vector[at : at + kept[key].size].reshape(kept[key].shape)
+            at += kept[key].size
+        with self._sim.tentatively():
+            self._sim.recall(replace(self._rest, state=settled, kept=kept))
+            outcome = self._sim.run(until=start.t + self._period)
+            if outcome.ending is not Ending.COMPLETED:
+                raise PgexciteError(f"the simulation did not get over the sample: {outcome.message}")
+            return self.read()

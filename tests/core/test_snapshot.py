@@ -84,6 +84,27 @@ def test_state_branches():
     assert not np.array_equal(calm.x, faulted.x)
 
 
+def test_an_order_given_at_the_point_is_in_the_snapshot(tmp_path):
+    """A controller switched by hand at a sampling instant learns of it at its next sample, after a snapshot as well."""
+    runs = [make("nmpc", "never") for _ in range(2)]
+    runs[0].run(until=0.1)
+    runs[0].set("controller.mpc.active", 0.0)
+    runs[0].save(tmp_path / "snapshot.npz")
+    runs[1].resume(tmp_path / "snapshot.npz")
+    assert [run.memory().kept["ordered:mpc"] for run in runs] == [1.0, 1.0]
+    for run in runs:
+        run.run()
+    assert np.array_equal(runs[0].state.x, runs[1].state.x)
+
+
+def test_a_snapshot_of_another_controller_is_refused(tmp_path):
+    sim = make("nmpc", "never")
+    sim.save(tmp_path / "snapshot.npz")
+    other = Simulation(kobbelv(), sim.settings, FAULT.changes(), {"mpc": MPC(unit="G2", backend="equivalent")})
+    with pytest.raises(SnapshotError, match="holds no"):
+        other.resume(tmp_path / "snapshot.npz")
+
+
 def test_a_snapshot_of_another_model_is_refused(tmp_path):
     sim = make("st1a", "never")
     sim.save(tmp_path / "snapshot.npz")

@@ -10,11 +10,13 @@ from plants import kobbelv, push, regulated
 
 from pgexcite.core.controller import Action
 from pgexcite.core.errors import PgexciteError
+from pgexcite.core.events import Change, When
 from pgexcite.core.linearise import linearise
 from pgexcite.core.measurement import Measurement
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.stage import ALPHA, BETA, GAMMA
+from pgexcite.core.trace import Ending
 from pgexcite.plugins.controllers.mpc import MPC
 from pgexcite.studies.ringdown import mode_near, ringdown_modes
 from pgexcite.studies.sampled_modes import sampled_modes
@@ -163,13 +165,54 @@ def test_predictive_control_swings_as_the_map_says(backend, options):
     assert found.eigenvalue == pytest.approx(swing.eigenvalue, abs=5e-4)  # measured 1.7e-5, 5e-5
 
 
-def test_it_leaves_the_simulation_where_it_was():
-    sim = simulation(mpc=MPC(unit="G2", backend="linear", options={"relinearise": "once"}))
-    sim.run(until=1.0)
-    before, memory = sim.state, sim.sessions["mpc"].memory()
-    sampled_modes(sim, 0.05)
-    assert sim.state is before
-    assert all(np.array_equal(memory[key], value) for key, value in sim.sessions["mpc"].memory().items())
+LOOPS = {
+    "integral": _Integral(2.0),
+    "integral, delayed": _Integral(2.0, measurement=Measurement(delay=2)),
+    "nmpc": MPC(unit="G2", dt=0.1, options={"tolerance": 1e-9}),
+    "linear": MPC(unit="G2", dt=0.1, backend="linear"),
+    "equivalent": MPC(unit="G2", dt=0.1, backend="equivalent"),
+}
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_the_simulation_goes_on_as_if_it_had_not_been_asked(loop):
+    """Bit for bit, with a voltage low for some time, an event still waiting, and one due; and nothing is recorded of it."""
+    settings = Settings(2.0, H, "tr_bdf2", "never", collapse_below=1.2, collapse_after=1.9)
+    waiting = When(signal="unit.G2.v_t", above=0.5, lasting=1.2)
+    changes = [
+        Change(1.1, {"infinite_bus.grid.v": 0.97}, "lower"),
+        Change(0.1, {"infinite_bus.grid.v": 0.99}, "higher again", when=waiting),
+    ]
+    asked, left = (Simulation(kobbelv(), settings, changes, {"mpc": LOOPS[loop]}) for _ in range(2))
+    for sim in (asked, left):
+        sim.run(until=1.0)
+    before, t, log = asked.memory(), asked.trace().t, asked.trace().log
+    outcome, spent = asked.outcome, asked.wall_time
+    sampled_modes(asked, 0.1, size=1e-4)
+    after = asked.memory()
+    assert after.state is before.state
+    assert all(np.array_equal(value, after.kept[key], equal_nan=True) for key, value in before.kept.items())
+    assert (asked.outcome, asked.wall_time) == (outcome, spent)
+    assert np.array_equal(asked.trace().t, t)
+    assert asked.trace().log == log
+    for sim in (asked, left):
+        sim.run()
+    assert asked.outcome == left.outcome
+    assert asked.outcome.ending is Ending.VOLTAGE_COLLAPSE
+    one, other = asked.trace(), left.trace()
+    assert one.log == other.log
+    assert "higher again" in " ".join(entry.text for entry in one.log)
+    assert one.columns.keys() == other.columns.keys()
+    for path in one.columns:
+        if not path.endswith("_ms"):
+            assert np.array_equal(one[path], other[path], equal_nan=True), path
+
+
+@pytest.mark.parametrize("imperfection", [{"noise": 0.01}, {"noise_omega": 1e-4}, {"loss": 0.1}])
+def test_measurements_that_are_chance_have_no_map(imperfection):
+    sim = simulation(integral=_Integral(2.0, measurement=Measurement(**imperfection)))
+    with pytest.raises(PgexciteError, match=r"controller\.integral\.measurement: its noise and losses"):
+        sampled_modes(sim, 0.1)
 
 
 def test_what_is_no_sample_of_a_loop_at_rest_is_refused():

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.controller import as_arrays
 from pgexcite.core.equivalent import Layout, Terminals
+from pgexcite.core.memory import as_arrays
 from pgexcite.plugins.estimators.mapped_filter import MappedFilter
 
 Array = NDArray[np.float64]

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 from scipy.stats import chi2
 
-from pgexcite.core.controller import as_arrays
 from pgexcite.core.declare import par
 from pgexcite.core.equivalent import TERMINALS, Equivalent
 from pgexcite.core.estimation import Estimate, Observer, Written
+from pgexcite.core.memory import as_arrays, those_under, under
 from pgexcite.core.settings import Compile
 from pgexcite.plugins.estimators.mapped_filter import Expectation, MappedFilter
 from pgexcite.plugins.estimators.network import HELD, LOWEST, Jump, Network, directions, spread, wandered
@@ -316,15 +316,14 @@ class _Tracker:
     def memory(self) -> Mapping[str, Array]:
         """State, covariance, the network and the clocks."""
         own = {name: getattr(self, f"_{name}") for name in self._CLOCKS} | {"x": self._kalman.x, "P": self._kalman.P}
-        return {**as_arrays(own), **{f"network:{key}": value for key, value in self._network.memory().items()}}
+        return as_arrays(own) | under("network", self._network.memory())
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
         self._kalman.x, self._kalman.P = memory["x"].copy(), memory["P"].copy()
         for name in self._CLOCKS:
             setattr(self, f"_{name}", float(memory[name]))
-        start = "network:"
-        self._network.recall({k.removeprefix(start): v for k, v in memory.items() if k.startswith(start)})
+        self._network.recall(those_under("network", memory))
 
     # As C.
 

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pgexcite.core.codegen import loop
-from pgexcite.core.controller import Plant, Sample, Surroundings, as_arrays
+from pgexcite.core.controller import Plant, Sample, Surroundings
 from pgexcite.core.declare import par
 from pgexcite.core.equivalent import TERMINALS, Equivalent
 from pgexcite.core.errors import ConfigError, Problem, RegistryError
 from pgexcite.core.estimation import Estimate, Estimator, Observer, Writable
 from pgexcite.core.export import Input, Parts
 from pgexcite.core.export.shooting import DELAYED, LOOPS, planning, refuse, tolerance
+from pgexcite.core.memory import as_arrays, those_under, under
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solution, Solver
@@ -117,15 +118,14 @@ class _Equivalent(Shooting):
     def memory(self) -> Mapping[str, Array]:
         """Plan, estimate, and the field voltages seen and sent last."""
         own = as_arrays({"before": self._before, "seen": self._seen, "sent": self._sent, "in_charge": self._in_charge})
-        return {**super().memory(), **own, **{f"observer:{key}": v for key, v in self._observer.memory().items()}}
+        return {**super().memory(), **own, **under("observer", self._observer.memory())}
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
         super().recall(memory)
         self._before, self._seen, self._sent = memory["before"], memory["seen"], memory["sent"]
         self._in_charge = bool(memory["in_charge"] > 0)
-        start = "observer:"
-        self._observer.recall({k.removeprefix(start): v for k, v in memory.items() if k.startswith(start)})
+        self._observer.recall(those_under("observer", memory))
 
     # Where the equivalent is.
 

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pgexcite.core import qp_by_name
 from pgexcite.core.codegen import loop
 from pgexcite.core.condensed import Condensed, Linearised
-from pgexcite.core.controller import Plant, Sample, Surroundings, as_arrays
+from pgexcite.core.controller import Plant, Sample, Surroundings
 from pgexcite.core.declare import par
 from pgexcite.core.errors import ConfigError, Problem
 from pgexcite.core.export import Input, Parts
@@ -28,6 +28,7 @@ from pgexcite.core.export.shooting import DELAYED
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.ladder import PLAUSIBLE
 from pgexcite.core.local import LocalModel
+from pgexcite.core.memory import as_arrays, those_under, under
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solution, Solver, Status
 from pgexcite.core.nameplate import own_model
@@ -227,17 +228,15 @@ class _Linear:
 
     def memory(self) -> Mapping[str, Array]:
         """Estimate, plan, and the point of linearisation."""
-        point = {f"point:{name}": getattr(self._local.point, name) for name in ("x", "z", "u")}
-        believed = {f"filter:{name}": value for name, value in self.filter.memory().items()}
+        point = {name: getattr(self._local.point, name) for name in ("x", "z", "u")}
         maybe = {"plan": self._plan, "since": self._since}
         kept = {"u": self._u, "age": self._age, **{key: value for key, value in maybe.items() if value is not None}}
-        return as_arrays(kept) | believed | point
+        return as_arrays(kept) | under("filter", self.filter.memory()) | under("point", point)
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off; from the initial point where it is empty."""
-        start = "filter:"
-        self.filter.recall({k.removeprefix(start): v for k, v in memory.items() if k.startswith(start)})
-        self._local.move(self._point_0.with_(**{name: memory[f"point:{name}"] for name in ("x", "z", "u") if memory}))
+        self.filter.recall(those_under("filter", memory))
+        self._local.move(self._point_0.with_(**those_under("point", memory)))
         self._plan, self._since = memory.get("plan"), memory.get("since")
         self._u = memory.get("u", self._point_0.u[self._commands] + self._u_bias)
         self._age = int(memory.get("age", 0))
