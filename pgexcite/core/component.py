@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -120,6 +121,11 @@ class Component(BaseModel):
             known: guesses of the device's signals made so far (the machine's come first: ``v_t``, ``e_fd``, ``i_fd``, ``t_m``).
         """
         return {}
+
+    @property
+    def longest_step(self) -> float:
+        """Step, s, up to which its timers keep their pace; a prediction whose steps grow past it is refused."""
+        return math.inf
 
     @classmethod
     def variables(cls, *kinds: Kind) -> tuple[Variable, ...]:

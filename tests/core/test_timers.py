@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from automaton import Automaton
+from plants import voltage_problem
 from tapped import plant, source
 
+from pgexcite.core.controller import Plant, Surroundings
+from pgexcite.core.errors import ConfigError
 from pgexcite.core.prediction import Horizon, Predictor
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
@@ -14,6 +19,7 @@ from pgexcite.core.step import Kernel
 from pgexcite.plugins.limiters.oel import OEL
 from pgexcite.plugins.limiters.scl import SCL
 from pgexcite.plugins.loads.exponential import AdditiveRecovery
+from pgexcite.plugins.mpc_backends.nmpc import NMPC
 from pgexcite.plugins.tap_changers.oltc import OLTC
 
 TAP = "transformer.T1.tap_changer"
@@ -102,6 +108,21 @@ def test_lateness_does_not_pile_up_where_the_step_is_longer_than_the_delay():
     positions = [automaton.step(v_re=0.9)["position"] for _ in range(5)]
     assert positions == [-1.0, -2.0, -3.0, -4.0, -5.0]
     assert automaton.d["timer"] == 3.0
+
+
+def test_a_prediction_whose_steps_outgrow_a_delay_is_refused():
+    """Twelve intervals growing by 1.4 from 2 s, in 20 steps each: 4.05 s at the end."""
+    command = "infinite_bus.grid.v"
+    problem = voltage_problem(command, dt=2.0, N_p=12, growth=1.4, voltages=("bus.LV.v",), speeds=(), P=np.empty(0))
+    for delay, refused in ((4.1, False), (4.0, True)):
+        sim = sagging(0.1, EDGES[0], T_next=delay)
+        told = pytest.raises(ConfigError, match=r"growth: .* 4\.05 s long, and timers of transformer\.T1\.tap_changer")
+        with told if refused else nullcontext():
+            NMPC().start(
+                problem,
+                Surroundings(0.1, "tr_bdf2", {command: 1.0}, {}, sim.model.system),
+                Plant(sim.model, sim.kernel, sim.p),
+            )
 
 
 def slid(limiter, name, course, h, t_end, **given):

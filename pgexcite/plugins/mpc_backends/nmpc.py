@@ -57,13 +57,15 @@ class NMPC(BaseModel):
         """Begin a run.
 
         Raises:
-            ConfigError: the prediction step does not divide the sample time, or a parameter of ``mismatch`` does not exist.
+            ConfigError: the prediction step does not divide the sample time, or grows past what timers of the model stand; or a
+                parameter of ``mismatch`` does not exist.
         """
         assert plant is not None, "a perfect-information backend is always handed the plant"
         h = self.step or surroundings.h
         count = round(problem.dt / h)
         if count < 1 or abs(count * h - problem.dt) > 1e-9:
             raise ConfigError([Problem("options.step", f"must divide the sample time {problem.dt:g} s", self.step)])
+        _check_growth(problem, plant, count)
         options = ShootingOptions(
             mode=self.mode,
             max_iterations=self.max_iterations,
@@ -88,6 +90,21 @@ class NMPC(BaseModel):
                 ]
             )
         return {known[path]: value for path, value in self.mismatch.items()}
+
+
+def _check_growth(problem: ControlProblem, plant: Plant, count: int) -> None:
+    """Refuse intervals whose steps are longer than a timer of the model stands."""
+    longest = float(problem.intervals().max()) / count
+    slow = {
+        device.component_path(slot): component.longest_step
+        for device in plant.model.system.devices
+        for slot, component in device.components.items()
+        if component.longest_step < longest
+    }
+    if slow:
+        path, limit = min(slow.items(), key=lambda item: item[1])
+        found = f"in the last interval steps are {longest:.3g} s long, and timers of {path} stand {limit:g} s"
+        raise ConfigError([Problem("growth", found, problem.growth, hint="a smaller growth, N_p or options.step")])
 
 
 class _Perfect(Shooting):

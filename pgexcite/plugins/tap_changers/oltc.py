@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import casadi as ca
@@ -56,6 +57,10 @@ class OLTC(TapChanger):
     repeated = discrete("-", "1 once a tap has been made on this side")
 
     error_before = before("pu", "deviation of the voltage at the beginning of a step")
+
+    @property
+    def longest_step(self) -> float:
+        return self.T_next or math.inf
 
     def equations(self, v: Signals) -> Equations:
         error = magnitude(v.v_re, v.v_im) - self.V_ref
