@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core import powerflow
-from pgexcite.core.assemble import Stated, Symbols, assemble
+from pgexcite.core.assemble import assemble
 from pgexcite.core.component import Terminal
 from pgexcite.core.declare import Kind
 from pgexcite.core.errors import InitialisationError, Problem
 from pgexcite.core.model import Model, State, require
 from pgexcite.core.powerflow import PowerFlow
+from pgexcite.core.stated import Stated, equations_of
+from pgexcite.core.symbols import Symbols
 from pgexcite.core.system import Device, System
 
 Array = NDArray[np.float64]
@@ -99,7 +101,7 @@ def _solve_device(
     device: Device, symbols: Symbols, flow: PowerFlow, S_base: float
 ) -> tuple[dict[str, float], list[Problem]]:
     """Steady state of one device by path, and what is wrong with it."""
-    stated = symbols.state(device, released=True)
+    stated = equations_of(device, symbols, released=True)
     v = flow.v[device.bus]
     terminal = Terminal(v, (flow.s[device.path] * S_base / device.S_n / v).conjugate())
     names, start = _start(device, terminal)
@@ -109,7 +111,7 @@ def _solve_device(
     rest = ca.vertcat(terminal.v.real, terminal.v.imag, 1.0, 0.0)
     known = [s for n, s in zip(symbols.p.names, symbols.p.symbols, strict=True) if n not in names]
     numbers = np.array([value for n, value in zip(symbols.p.names, symbols.p.values, strict=True) if n not in names])
-    d = ca.vertcat(*symbols.d.symbols) if symbols.d.symbols else ca.SX(0, 1)
+    d = symbols.d.vector
     checks = _limits(stated)
     bounded = ca.substitute(ca.vertcat(ca.SX(0, 1), *(e for _, *es in checks for e in es)), given, rest)
     residual = ca.substitute(residual, given, rest)
