@@ -260,22 +260,32 @@ def alone(unit, V_ref):
 
 
 ALONE = {
-    "G1": (alone("G1", 1.06), 0.138),
-    "G2": ((), 0.194),
-    "G3": (alone("G3", 1.0), 0.146),
-    "G4": (alone("G4", 1.02), 0.129),
-    "G2, one move": (ONE_MOVE, 0.113),
+    "G1": (alone("G1", 1.06), 0.138, 1.3),
+    "G2": ((), 0.194, 1.3),
+    "G3": (alone("G3", 1.0), 0.146, 1.3),
+    "G4": (alone("G4", 1.02), 0.129, 1.3),
+    "G2, one move": (ONE_MOVE, 0.113, 1.1),
 }
-"""Damping ratio after the steps with the controller on its equivalent at one unit and stabilisers at the other three."""
+"""Damping ratio after the steps with the controller on its equivalent at one unit and stabilisers at the other three, and a factor
+by which it is above that of the three stabilisers and a regulator without one.
+
+The matrix pencil is not what scatters: other windows give the ratio to 1 %, half the step to three digits. It is the estimator's
+tuning: each of its random walks and noises doubled or halved, or another first x_s, which it has no cause to leave here, move the
+ratio by -13 to +21 %; measurement noise of 1e-3 pu by -13 to +15 %.
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("unit", ALONE)
-def test_alone_on_its_equivalent_it_damps_about_as_a_stabiliser(unit):
-    overrides, measured = ALONE[unit]
+@pytest.mark.parametrize("case", ALONE)
+def test_alone_on_its_equivalent_it_damps_about_as_a_stabiliser(case):
+    overrides, measured, factor = ALONE[case]
     sim, ending = run("step_equivalent_one", *overrides)
     assert ending == "completed"
-    assert inter_area(sim).damping == pytest.approx(measured, rel=0.35)
+    damping = inter_area(sim).damping
+    assert damping == pytest.approx(measured, rel=0.1)
+    without = simulation("thyristor_pss", "event=[]", f"unit.{case[:2]}.stabiliser.K_STAB=0.0")
+    # measured 0.093, 0.099, 0.090 and 0.091 without: factors of 1.48, 1.96, 1.61, 1.42 and, with one move, 1.14
+    assert damping > factor * lightly_damped(linearise(without.model, without.state, without.p).modes()).damping
 
 
 @pytest.mark.slow
