@@ -10,6 +10,8 @@ import numpy as np
 
 from pgexcite.core.blocks import magnitude
 from pgexcite.core.declare import Expr, Kind
+from pgexcite.core.errors import AssemblyError
+from pgexcite.core.limiting import mismatches
 from pgexcite.core.model import Model, require
 from pgexcite.core.network import complex_product
 from pgexcite.core.stated import Stated, equations_of
@@ -28,6 +30,9 @@ def assemble(system: System) -> Model:
     Raises:
         AssemblyError: components do not fit together.
     """
+    for device in system.devices:
+        for found in mismatches(device):
+            raise AssemblyError(f"{found.path}: {found.message}; {found.hint}")
     symbols = Symbols(system)
     stated = {device.path: equations_of(device, symbols) for device in system.devices}
     reference, omega_ref = _reference(system, symbols, stated)

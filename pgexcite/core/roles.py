@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from pgexcite.core.component import Component
-from pgexcite.core.declare import par, port_in, port_out
+from pgexcite.core.declare import Kind, par, port_in, port_out
 
 
 class Machine(Component):
@@ -38,6 +39,12 @@ class Exciter(Component):
     v_s = port_in("pu", "stabiliser signal", default=0.0)
     e_fd = port_out("pu", "field voltage")
 
+    LIMITERS: ClassVar[tuple[str, ...]] = ("v_oel", "v_uel", "v_scl")
+
+    def takes(self) -> Mapping[str, Literal["sum", "gate", "nothing"]]:
+        """What becomes of each limiter's signal it has an input for; summed, unless an exciter says otherwise."""
+        return {item.name: "sum" for item in self.variables(Kind.INPUT) if item.name in self.LIMITERS}
+
 
 class _DrivesField(Component):
     e_fd = port_out("pu", "field voltage")
@@ -65,6 +72,11 @@ class Limiter(Component):
     """An excitation limiter: from machine quantities to a signal the exciter sums or takes over with."""
 
     role: ClassVar[str] = "limiter"
+
+    @property
+    def acts_as(self) -> Literal["sum", "gate", "either"]:
+        """What its signal is made for: to be summed at the regulator's input, for a gate to select, or either."""
+        return "either"
 
 
 class Governor(Component):

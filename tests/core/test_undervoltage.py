@@ -14,6 +14,7 @@ from pgexcite.core.simulate import Simulation
 from pgexcite.core.system import Device, Schedule, System
 from pgexcite.core.trace import Ending
 from pgexcite.core.undervoltage import Undervoltage
+from pgexcite.plugins.exciters.st1a import ST1A
 from pgexcite.plugins.limiters.oel import OEL
 from pgexcite.plugins.loads.zip import ConstantImpedance
 from pgexcite.plugins.sources.infinite_bus import InfiniteBus
@@ -55,9 +56,8 @@ def test_a_sagging_bus_ends_the_run_with_its_name_the_time_and_what_was_active()
 
 
 def test_a_limiter_that_acts_is_named():
-    system = kobbelv(limiter=OEL(I_LIM=1.0, T_LIM=0.5))
-    changes = ParameterStep(type="set", t=0.5, path="unit.G2.exciter.e_fd_ref", value=0.8).changes()
-    sim = Simulation(system, Settings(20.0, 0.01, compile="never", collapse_below=0.8, collapse_after=0.0), changes)
+    system = kobbelv(exciter=ST1A(oel_position=3), limiter=OEL(I_LIM=0.8, T_LIM=0.5))
+    sim = Simulation(system, Settings(20.0, 0.01, compile="never", collapse_below=0.8, collapse_after=0.0))
     outcome = sim.run()
     assert outcome.ending is Ending.VOLTAGE_COLLAPSE
     assert outcome.active == ("unit.G2.limiter acts",)

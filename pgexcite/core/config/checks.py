@@ -14,6 +14,7 @@ from pgexcite.core import registry
 from pgexcite.core.config.validate import Collector
 from pgexcite.core.declare import Kind
 from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, HandOver, LoadStep, ParameterStep, boundary
+from pgexcite.core.limiting import mismatches
 from pgexcite.core.network import Branch
 from pgexcite.core.system import Device, System
 
@@ -69,6 +70,13 @@ def check_islands(system: System, collect: Collector) -> None:
                 f"without V: {_listed(free)}; with all of P, Q and V: {_listed(full)}; there must be as many of these as of those",
                 hint="leave V out at one infinite bus for each unit that is given P, Q and V",
             )
+
+
+def check_limiters(system: System, collect: Collector) -> None:
+    """Limiters have an exciter that takes their signals as they are made."""
+    for device in system.devices:
+        for found in mismatches(device):
+            collect.add(found.path, found.message, hint=found.hint)
 
 
 def check_reference(reference: str, grid: Grid, collect: Collector) -> None:

@@ -33,7 +33,7 @@ class ST1A(Exciter):
 
     At (2) and (3) stand a high-value gate with ``v_uel`` and then a low-value gate with ``v_oel``. The 2005 edition has the
     overexcitation limiter at the output only; its other positions are those of ST1C in the 2016 edition. A position other than 0
-    wants a limiter in the unit: without one a gate never acts, and a sum is far off. The limits of the regulator do not wind up,
+    wants a limiter in the unit that is made for it, and a limiter a position. The limits of the regulator do not wind up,
     those of the rectifier do. A time constant of zero takes its block out.
 
     Defaults: Kundur's thyristor exciter; the limits of the error and of the regulator are out of reach.
@@ -76,6 +76,10 @@ class ST1A(Exciter):
     v_a = state("pu", "regulator output", guess=1.0)
     x_f = state("pu", "field voltage lagged by T_F", guess=1.0)
     v_ref = setpoint("pu", "voltage reference", guess=1.0)
+
+    def takes(self) -> Mapping[str, Literal["sum", "gate", "nothing"]]:
+        at: dict[int, Literal["sum", "gate", "nothing"]] = {0: "nothing", 1: "sum", 2: "gate", 3: "gate"}
+        return {"v_oel": at[self.oel_position], "v_uel": at[self.uel_position], "v_scl": "sum"}
 
     def equations(self, v: Signals) -> Equations:
         e_fd = self._rectifier(v)

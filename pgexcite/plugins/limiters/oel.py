@@ -58,6 +58,10 @@ class OEL(TimedLimiter):
     i_m = state("pu", "sensed field current", guess=1.0)
     x_i = state("pu", "integrator")
 
+    @property
+    def acts_as(self) -> Literal["sum", "gate"]:
+        return "gate" if self.acts == "takeover" else "sum"
+
     def equations(self, v: Signals) -> Equations:
         sensed = lag(v.i_fd, v.i_m, T=self.T_F)
         error = self.I_LIM - sensed.y

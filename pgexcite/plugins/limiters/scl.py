@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import casadi as ca
 
@@ -49,6 +49,10 @@ class SCL(TimedLimiter):
     v_scl = port_out("pu", "limiter's signal")
     x_o = state("pu", "integrator of the overexcited side")
     x_u = state("pu", "integrator of the underexcited side")
+
+    @property
+    def acts_as(self) -> Literal["sum"]:
+        return "sum"
 
     def equations(self, v: Signals) -> Equations:
         square = v.p_e * v.p_e + v.q_e * v.q_e

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import casadi as ca
 
@@ -56,6 +56,10 @@ class UEL1(Limiter):
     x_i = state("pu", "integrator")
     x_1 = state("pu", "first lead-lag")
     x_2 = state("pu", "second lead-lag")
+
+    @property
+    def acts_as(self) -> Literal["sum", "gate"]:
+        return "sum" if self.V_UIMIN == 0 else "gate"
 
     def equations(self, v: Signals) -> Equations:
         error = self._error(v.v_t, v.p_e, v.q_e)
