@@ -27,6 +27,7 @@ class AtWork:
 
     Attributes:
         controller: as configured.
+        perfect: whether it is handed the plant's state and parameters.
         session: it at work.
         instruments: what it measures with.
         every: its sample time in steps.
@@ -36,6 +37,7 @@ class AtWork:
     """
 
     controller: Controller
+    perfect: bool
     session: Session
     instruments: Instruments
     every: int
@@ -45,9 +47,8 @@ class AtWork:
 
     def act(self, state: State, p: Array, y: Array) -> tuple[Action, float]:
         """Its answer at this point, of which ``y`` are the outputs, and the wall time that took, ms."""
-        perfect = self.controller.information == "perfect"
         measured = self.instruments.read(state.k // self.every, np.concatenate((y, state.u))[self.columns])
-        own, parameters = (state, p.copy()) if perfect else (None, None)
+        own, parameters = (state, p.copy()) if self.perfect else (None, None)
         sample = Sample(state.t, measured, self.active, own, parameters, self.ordered)
         self.ordered = False
         began = time.perf_counter()
@@ -106,4 +107,4 @@ def start(
     )
     session = controller.start(surroundings, plant)
     instruments = Instruments(controller.measurement, names, setpoints)
-    return AtWork(controller, session, instruments, every, columns, controller.active)
+    return AtWork(controller, perfect, session, instruments, every, columns, controller.active)

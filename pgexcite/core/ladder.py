@@ -17,8 +17,9 @@ cost a machine its synchronism.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,13 @@ PLAUSIBLE = 1e3
 """Largest measured value that is believed, pu."""
 MOVED = 1e-6
 """A command that moved by more than this moves what is measured."""
+
+_KEPT: Mapping[Callable[[Array], Any], tuple[str, ...]] = {
+    np.asarray: ("u", "move", "next", "plan", "seen", "home"),
+    int: ("reused", "stale", "good"),
+    bool: ("in_charge", "stepped_down", "returning"),
+}
+"""What a ladder remembers, by type."""
 
 
 @dataclass(frozen=True)
@@ -145,30 +153,14 @@ class Ladder:
 
     def memory(self) -> Mapping[str, Array]:
         """All that is kept between samples."""
-        names = (
-            "u",
-            "move",
-            "next",
-            "plan",
-            "reused",
-            "stale",
-            "seen",
-            "good",
-            "in_charge",
-            "stepped_down",
-            "returning",
-            "home",
-        )
-        own = as_arrays({name: getattr(self, f"_{name}") for name in names})
+        own = as_arrays({name: getattr(self, f"_{name}") for names in _KEPT.values() for name in names})
         return own | under("solver", self.solver.memory())
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
-        names = ("u", "move", "next", "plan", "seen", "home")
-        self._u, self._move, self._next, self._plan, self._seen, self._home = (memory[name] for name in names)
-        self._reused, self._stale, self._good = (int(memory[name]) for name in ("reused", "stale", "good"))
-        flags = ("in_charge", "stepped_down", "returning")
-        self._in_charge, self._stepped_down, self._returning = (bool(memory[name] > 0) for name in flags)
+        for kind, names in _KEPT.items():
+            for name in names:
+                setattr(self, f"_{name}", kind(memory[name]))
         self.solver.recall(those_under("solver", memory))
 
     # Before the plan.

@@ -84,28 +84,17 @@ class DeviceReader:
         return {key: value for key, value in plain(element).items() if key not in unsaid}
 
     def _source(self, kind: str, name: str, table: Mapping[str, Any]) -> dict[str, Any]:
-        path = f"{kind}.{name}"
-        own, rest = _split(table, tables.InfiniteBusTable)
-        said = self._collect.validate(tables.InfiniteBusTable, own, path)
-        if said is None:
-            return {}
-        self._check_bus(said.bus, f"{path}.bus")
-        model = self._component("source", said.model, rest, path, also=tables.InfiniteBusTable.model_fields)
-        if model is None:
+        said, model = self._at_bus("source", tables.InfiniteBusTable, table, f"{kind}.{name}")
+        if said is None or model is None:
             return {}
         schedule = Schedule(V=said.V, angle=radians(said.angle_deg))
-        self.devices.append(Device(path, said.bus, self._S_base, {"": model}, schedule))
+        self.devices.append(Device(f"{kind}.{name}", said.bus, self._S_base, {"": model}, schedule))
         return plain(said) | plain(model)
 
     def _load(self, kind: str, name: str, table: Mapping[str, Any]) -> dict[str, Any]:
         path = f"{kind}.{name}"
-        own, rest = _split(table, tables.LoadTable)
-        said = self._collect.validate(tables.LoadTable, own, path)
-        if said is None:
-            return {}
-        self._check_bus(said.bus, f"{path}.bus")
-        model: Any = self._component("load", said.model, rest, path, also=tables.LoadTable.model_fields)
-        if model is None:
+        said, model = self._at_bus("load", tables.LoadTable, table, path)
+        if said is None or model is None:
             return {}
         if not {"P", "Q"} <= set(model.numeric_parameters()):
             self._collect.add(
@@ -114,6 +103,16 @@ class DeviceReader:
             return {}
         self.devices.append(Device(path, said.bus, self._S_base, {"": model}, Schedule(P=-model.P, Q=-model.Q)))
         return plain(said) | plain(model)
+
+    def _at_bus(self, role: str, cls: type[tables.Table], table: Mapping[str, Any], path: str) -> tuple[Any, Any]:
+        """What a table says of a device of one component, and the component, whose parameters stand beside it."""
+        own = {key: value for key, value in table.items() if key in cls.model_fields}
+        said: Any = self._collect.validate(cls, own, path)
+        if said is None:
+            return None, None
+        self._check_bus(said.bus, f"{path}.bus")
+        rest = {key: value for key, value in table.items() if key not in own}
+        return said, self._component(role, said.model, rest, path, also=cls.model_fields)
 
     def _unit(self, kind: str, name: str, table: Mapping[str, Any]) -> dict[str, Any]:
         path = f"{kind}.{name}"
@@ -213,12 +212,6 @@ def _slots(table: Mapping[str, Any]) -> list[tuple[str, str, str | None]]:
 
 def _is_model(table: Mapping[str, Any]) -> bool:
     return "model" in table or not all(isinstance(value, dict) for value in table.values())
-
-
-def _split(table: Mapping[str, Any], cls: type[tables.Table]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A table's own keys, and those of the model that stand beside them."""
-    own = {key: value for key, value in table.items() if key in cls.model_fields}
-    return own, {key: value for key, value in table.items() if key not in own}
 
 
 def _store(data: dict[str, Any], parts: list[str], value: dict[str, Any]) -> None:
