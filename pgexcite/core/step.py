@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.linalg import splu
 
 from pgexcite.core.codegen import CompilationError, CompiledLoop, build, compiler, generate
 from pgexcite.core.model import Model, State
+from pgexcite.core.pivoting import solved
 from pgexcite.core.settings import Compile, Rule
 from pgexcite.core.stage import ALPHA, BETA, FROZEN, GAMMA, UPDATE_WEIGHT, build_stage_functions, write_stage
 
@@ -34,8 +35,12 @@ STARTUP_STEPS = 2
 """Backward-Euler steps after a discontinuity when the rule is trapezoidal."""
 MOVED = 1e-6
 """A discrete state that moves an algebraic unknown by more than this, pu, makes a discontinuity."""
-COMPILED_BY_DEFAULT = 3500
-"""Operations of a Newton iteration up to which ``compile = "auto"`` waits for the compiler (a few seconds)."""
+COMPILED_BY_DEFAULT = 10_000
+"""Operations of a library's functions up to which ``compile = "auto"`` waits for the compiler: 1.2 s with gcc 12.
+
+The time to compile and the time a step saves grow alike with the model: C has paid after 7,000 to 14,000 steps, be it of one
+machine (2,100 to 3,400 operations) or of two areas or the regional system (16,000, some 2 s). So size does not say where C pays,
+only how long a first run waits (tools/bench/compiling.py)."""
 SUBDIVISIONS = (2, 8, 32, 128)
 """Numbers of equal inner steps a failing step is retried in, one after the other."""
 
@@ -115,7 +120,8 @@ class Kernel:
         self._with = self._prepared[0]
         functions = self.functions
         self._update = bind(functions.update, [self.start, self._here, self.d, self.u, self.p, self._h], [self._d_next])
-        self._compiled = self._compile(compile)
+        self._choice = compile
+        self._compiled = self._compile()
 
     @property
     def compiled(self) -> bool:
@@ -149,20 +155,28 @@ class Kernel:
         assert f.newton is not None, "too large to be written out"
         return [f.prepare, f.newton, f.check, f.update]
 
-    def _compile(self, choice: Compile) -> CompiledLoop | None:
-        functions = self.functions
-        if choice == "never" or functions.newton is None or (choice in ("auto", "wait") and compiler() is None):
+    def _compile(self) -> CompiledLoop | None:
+        choice = self._choice
+        if choice == "never" or self.functions.newton is None or (choice in ("auto", "wait") and compiler() is None):
             return None
-        source = generate([*self.stepping(), self.functions.land], self.constants(), ["step.c", "advance.c"])
+        called = [*self.stepping(), self.functions.land]
+        source = generate(called, self.constants(), ["step.c", "advance.c"])
         try:
-            library = build(
-                source, only_cached=choice == "auto" and functions.newton.n_instructions() > COMPILED_BY_DEFAULT
-            )
+            library = self.library(source, called)
         except CompilationError:
             if choice == "always":
                 raise
             return None
         return None if library is None else CompiledLoop(library)
+
+    def library(self, source: str, called: list[ca.Function]) -> Path | None:
+        """The library of a source with these functions; ``None`` where ``compile = "auto"`` does not wait for it.
+
+        Raises:
+            CompilationError: no compiler, or it failed.
+        """
+        large = sum(function.n_instructions() for function in called) > COMPILED_BY_DEFAULT
+        return build(source, only_cached=large and self._choice == "auto")
 
     # The public faces: pure functions of frozen states.
 
@@ -302,8 +316,12 @@ class Kernel:
                 return True
             if not pivoting:
                 return False
-        self.w[:] = start
-        return self._solve_pivoting()
+        iterations = 4 * MAX_ITERATIONS
+        found = solved(self._residual, start, tolerance=TOLERANCE, update_weight=UPDATE_WEIGHT, iterations=iterations)
+        if found is None:
+            return False
+        self.w[:] = found
+        return True
 
     def _iterate(self, *, last: bool) -> bool:
         """Newton from ``w``, where the solution is left as well.
@@ -330,37 +348,6 @@ class Kernel:
                 return True
             if not total < 1e20:
                 return False
-        return False
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def _solve_pivoting(self) -> bool:
-        """Damped Newton on the stage with a pivoting sparse LU, where the fixed order fails or does not exist."""
-        w = self.w.copy()
-        r, jacobian = self._residual(w)
-        error = float(np.linalg.norm(r))
-        for _ in range(4 * MAX_ITERATIONS):
-            if not np.isfinite(error):
-                return False
-            try:
-                step = splu(jacobian).solve(r)
-            except RuntimeError:
-                return False
-            scale = 1.0
-            while True:
-                trial = w - scale * step
-                r_trial, jacobian_trial = self._residual(trial)
-                error_trial = float(np.linalg.norm(r_trial))
-                if error_trial < (1 - 0.1 * scale) * error or error_trial < TOLERANCE or scale < 1e-3:
-                    break
-                scale /= 2
-            update = scale * float(np.linalg.norm(step)) * UPDATE_WEIGHT**0.5
-            converged = error < TOLERANCE and error_trial < TOLERANCE and update < TOLERANCE
-            if not error_trial < error and not converged:
-                return False
-            w, r, jacobian, error = trial, r_trial, jacobian_trial, error_trial
-            if converged:
-                self.w[:] = w
-                return True
         return False
 
     def _residual(self, w: Array) -> tuple[Array, sp.csc_matrix]:

@@ -129,14 +129,6 @@ def test_only_cached_compiles_nothing(cache):
     assert path.parent == cache_directory()
 
 
-def test_auto_does_not_wait_for_a_large_model(monkeypatch, cache):
-    monkeypatch.setattr("pgexcite.core.step.COMPILED_BY_DEFAULT", 10)
-    assert not simulation("auto").kernel.compiled
-    assert libraries(cache) == []
-    assert simulation("always").kernel.compiled
-    assert simulation("auto").kernel.compiled  # it is there by now
-
-
 def test_two_kernels_of_one_model_share_no_work_arrays():
     initial = initialise(kobbelv())
     kernels = [Kernel(initial.model, initial.state, initial.p, "always") for _ in range(2)]

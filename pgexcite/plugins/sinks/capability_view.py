@@ -19,7 +19,6 @@ SCALE = 100.0
 """Drawn length of 1 pu; the viewer's sizes are in the drawing's units."""
 ROOT = "capability"
 _AXIS = (120, 130, 140)
-_TRAIL = 0.9
 
 LIMITS = (
     ("stator", "stator current", (90, 160, 255)),
