@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -105,3 +105,16 @@ class Shunt(NetworkElement):
 def complex_product(g: Expr, b: Expr, v: tuple[Expr, Expr]) -> tuple[Expr, Expr]:
     """``(g + jb) (v_re + j v_im)`` as a pair."""
     return g * v[0] - b * v[1], g * v[1] + b * v[0]
+
+
+def islands(buses: Iterable[str], links: Iterable[tuple[str, str]]) -> dict[str, tuple[str, ...]]:
+    """For each bus all that are joined to it by links between two buses, itself among them, in the order the buses came in."""
+    joined = {bus: [bus] for bus in buses}
+    for one, other in links:
+        keep, join = joined[one], joined[other]
+        if keep is not join:
+            keep += join
+            joined.update(dict.fromkeys(join, keep))
+    place = {bus: k for k, bus in enumerate(joined)}
+    found = {id(members): tuple(sorted(members, key=place.__getitem__)) for members in joined.values()}
+    return {bus: found[id(members)] for bus, members in joined.items()}

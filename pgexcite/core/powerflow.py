@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from pgexcite.core.errors import PowerFlowError, Problem
@@ -122,26 +121,16 @@ def solve(system: System) -> PowerFlow:
 
 
 def _check_islands(system: System) -> None:
-    names = list(system.buses)
-    index = {name: k for k, name in enumerate(names)}
-    live = [b for b in system.branches().values() if b.status > 0]
-    links = sp.coo_matrix(
-        (np.ones(len(live)), ([index[b.from_bus] for b in live], [index[b.to_bus] for b in live])),
-        shape=(len(names), len(names)),
-    )
-    count, label = connected_components(links, directed=False)
-    anchored = {int(label[index[d.bus]]) for d in system.devices if d.schedule.angle is not None}
-    problems = []
-    for island in range(count):
-        if island not in anchored:
-            members = [name for name in names if label[index[name]] == island]
-            problems.append(
-                Problem(
-                    f"bus.{members[0]}",
-                    f"the island of {', '.join(members)} has no slack unit and no infinite bus",
-                    hint="connect it with a line or transformer, or set slack = true on one of its units",
-                )
-            )
+    anchored = {device.bus for device in system.devices if device.schedule.angle is not None}
+    problems = [
+        Problem(
+            f"bus.{members[0]}",
+            f"the island of {', '.join(members)} has no slack unit and no infinite bus",
+            hint="connect it with a line or transformer, or set slack = true on one of its units",
+        )
+        for members in system.islands()
+        if anchored.isdisjoint(members)
+    ]
     if problems:
         raise PowerFlowError(problems)
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.model import Model
+from pgexcite.core.network import islands
 
 Array = NDArray[np.float64]
 
@@ -39,16 +40,16 @@ class RotorAngles:
         if self._in_service is not None and np.array_equal(in_service, self._in_service):
             return
         self._in_service = in_service
-        island = _islands(self._all, [ends for ends, on in zip(self._ends, in_service, strict=True) if on])
+        island = islands(self._all, [ends for ends, on in zip(self._ends, in_service, strict=True) if on])
         n = len(self.names)
         # An angle's reference is (angles @ weights) plus the theta of column thetas; -1 is none.
         self._weights, self._thetas = np.zeros((n, n)), np.full(n, -1)
         sources = {island[bus]: theta for bus, theta in reversed(self._sources.items())}
-        for number in {island[bus] for bus in self._buses}:
-            members = np.array([island[bus] == number for bus in self._buses])
+        for one in {island[bus] for bus in self._buses}:
+            members = np.array([island[bus] == one for bus in self._buses])
             inertia = np.where(members, self._inertia, 0.0)
-            if number in sources:
-                theta = sources[number]
+            if one in sources:
+                theta = sources[one]
                 self._thetas[members] = -1 if theta is None else theta
             elif np.all(inertia[members] > 0):
                 self._weights[:, members] = (inertia / inertia.sum())[:, None]
@@ -76,19 +77,6 @@ def dead_buses(model: Model, p: Array) -> tuple[str, ...]:
     """Buses that no branch in service joins to a machine or a source, at parameters ``p``."""
     system = model.system
     live = [b for path, b in system.branches().items() if p[model.position("p", f"{path}.status")] > 0]
-    island = _islands(tuple(system.buses), [(branch.from_bus, branch.to_bus) for branch in live])
+    island = islands(tuple(system.buses), [(branch.from_bus, branch.to_bus) for branch in live])
     fed = {island[d.bus] for d in system.devices if any(c.role in {"machine", "source"} for c in d.components.values())}
     return tuple(bus for bus in system.buses if island[bus] not in fed)
-
-
-def _islands(buses: tuple[str, ...], branches: list[tuple[str, str]]) -> dict[str, str]:
-    """The island of each bus, named after one of its buses."""
-    of = {bus: bus for bus in buses}
-    members = {bus: [bus] for bus in buses}
-    for one, other in branches:
-        keep, join = of[one], of[other]
-        if keep != join:
-            for bus in members[join]:
-                of[bus] = keep
-            members[keep] += members.pop(join)
-    return of

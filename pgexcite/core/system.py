@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from pgexcite.core.component import Component
-from pgexcite.core.network import Bus, Line, Shunt, Transformer
+from pgexcite.core.network import Bus, Line, Shunt, Transformer, islands
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,12 @@ class System:
         found: dict[str, Line | Transformer] = {f"line.{name}": item for name, item in self.lines.items()}
         found.update({f"transformer.{name}": item for name, item in self.transformers.items()})
         return found
+
+    def islands(self) -> list[tuple[str, ...]]:
+        """Buses in groups that branches in service hold together; a branch from or to a bus that does not exist holds none."""
+        live = [branch for branch in self.branches().values() if branch.status > 0]
+        links = [(b.from_bus, b.to_bus) for b in live if b.from_bus in self.buses and b.to_bus in self.buses]
+        return list(dict.fromkeys(islands(self.buses, links).values()))
 
     def device(self, path: str) -> Device:
         """The device at this path.

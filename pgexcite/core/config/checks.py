@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, get_args
@@ -15,7 +15,6 @@ from pgexcite.core.config.validate import Collector
 from pgexcite.core.declare import Kind
 from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, HandOver, LoadStep, ParameterStep, boundary
 from pgexcite.core.limiting import mismatches
-from pgexcite.core.network import Branch
 from pgexcite.core.system import Device, System
 
 EVENTS: dict[str, type[BaseModel]] = {
@@ -39,20 +38,9 @@ class Grid:
     broken: frozenset[str]
 
 
-def islands(buses: Iterable[str], branches: Iterable[Branch]) -> list[tuple[str, ...]]:
-    """Buses in groups that branches in service hold together, in the order the buses came in."""
-    island = {name: {name} for name in buses}
-    for branch in branches:
-        if branch.status > 0 and branch.from_bus in island and branch.to_bus in island:
-            joined = island[branch.from_bus] | island[branch.to_bus]
-            island.update(dict.fromkeys(joined, joined))
-    groups = {id(members): members for members in island.values()}
-    return [tuple(name for name in island if name in members) for members in groups.values()]
-
-
 def check_islands(system: System, collect: Collector) -> None:
     """Every island needs something that holds its angle, and as many voltages left free as a unit fixes too much."""
-    for members in islands(system.buses, system.branches().values()):
+    for members in system.islands():
         there = [device for device in system.devices if device.bus in members]
         where = f"bus.{members[0]}"
         if not any(device.schedule.angle is not None for device in there):
