@@ -278,6 +278,20 @@ def test_a_live_run_ends_without_a_viewer(tmp_path):
     assert (tmp_path / "out" / "summary.json").exists()
 
 
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_what_is_valid_and_odd_is_remarked(scenario, tmp_path, command):
+    late = FAULT.replace("t = 0.5", "t = 1.45")
+    out = ["--out", tmp_path / "out"] if command == "run" else []
+    result = call(command, scenario(f"{late}[line.L1]\nX = -0.01\n"), *SHORT, *out)
+    assert result.exit_code == 0, result.stderr
+    notes = [line for line in result.stderr.splitlines() if line.startswith("note: ")]
+    assert notes == [
+        "note: line.L1.X = -0.01 is negative, as that of a series capacitor",
+        "note: the run ends at 1.5 s, before fault at bus HV cleared (t = 1.55 s)",
+    ]
+    assert "note" not in call("check", SMIB / "fault_st1a.toml").stderr
+
+
 def test_check_prints_the_operating_point():
     found = figures("check", SMIB / "fault_constant.toml")
     buses = {row["bus"]: row for row in found["buses"]}

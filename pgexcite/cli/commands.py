@@ -74,6 +74,7 @@ def run(
     from pgexcite.core.summary import summarise
 
     scenario = load(config, overrides)
+    show.remarks(scenario)
     directory = out or Path("runs") / config.stem
     ensure_replaceable(directory)
     result = execute(scenario, directory, live=live, resume=resume, snapshot_at=snapshot_at)
@@ -147,6 +148,7 @@ def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     from pgexcite.core.initialise import initialise
 
     scenario = load(config, overrides)
+    show.remarks(scenario)
     point = show.operating_point(initialise(scenario.system))
     if as_json:
         show.json(point)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from pgexcite.core.config import Scenario
     from pgexcite.core.initialise import Initial
 
 
@@ -60,6 +61,14 @@ def summary(title: str, message: str, figures: Mapping[str, Any], directory: Pat
             )
         table(rows)
     click.echo(f"{figures['steps']} steps in {figures['wall_time']:.3g} s; record: {directory}")
+
+
+def remarks(scenario: Scenario) -> None:
+    """Say on standard error what is valid and yet likely not what was meant."""
+    from pgexcite.core.config import remarks as made
+
+    for text in made(scenario):
+        click.echo(f"note: {text}", err=True)
 
 
 def timing(figures: Mapping[str, Any]) -> None:

@@ -21,7 +21,7 @@ class When(BaseModel):
     signal: str = Field(description="path of an output: unit.G2.v_t, bus.HV.v, ...")
     below: float | None = Field(None, description="threshold it goes below")
     above: float | None = Field(None, description="threshold it goes above")
-    lasting: float = Field(0.0, ge=0, description="s for which it must stay there")
+    lasting: float = Field(0.0, ge=0, description="time for which it must stay there, s")
     after: float = Field(0.0, ge=0, description="time from which on it is looked at, s")
 
     @property
@@ -88,7 +88,7 @@ class Fault(_Event):
     bus: str
     R: float = Field(0.0, ge=0, description="fault resistance, pu of the system base; 0 with X = 0 is a bolted fault")
     X: float = Field(0.0, ge=0, description="fault reactance, pu of the system base")
-    duration: float | None = Field(None, gt=0, description="s until the fault clears; never, where left out")
+    duration: float | None = Field(None, gt=0, description="time until the fault clears, s; never, where left out")
 
     def _changes(self, t: float) -> tuple[Change, ...]:
         at = f"bus.{self.bus}."
@@ -104,7 +104,7 @@ class BranchTrip(_Event):
 
     type: Literal["line_trip", "transformer_trip"]
     name: str
-    reclose_after: float | None = Field(None, gt=0, description="s until it closes again")
+    reclose_after: float | None = Field(None, gt=0, description="time until it closes again, s")
 
     def _changes(self, t: float) -> tuple[Change, ...]:
         kind = self.type.removesuffix("_trip")
@@ -131,8 +131,8 @@ class LoadStep(_Event):
 
     type: Literal["load_step"]
     load: str
-    dP: float = Field(0.0, description="MW added")
-    dQ: float = Field(0.0, description="Mvar added")
+    dP: float = Field(0.0, description="active power added, MW")
+    dQ: float = Field(0.0, description="reactive power added, Mvar")
 
     def _changes(self, t: float) -> tuple[Change, ...]:
         path = f"load.{self.load}."
