@@ -84,7 +84,7 @@ def objections(model: Model, changes: Sequence[Change], controllers: Iterable[st
         if change.when is not None and change.when.signal not in model.index["y"]:
             near = model.nearest(change.when.signal)
             problems.append(Problem(change.when.signal, f"no such output ({change.text} waits for it)", hint=near))
-        for path in (*change.values, *(change.increments or {})):
+        for path, _, _ in change.assignments():
             known = path in model.index["u"] or path in model.index["p"]
             if not known and switched(path) not in names:
                 near = model.nearest(path)

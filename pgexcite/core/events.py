@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -49,8 +49,13 @@ class Change:
     t: float
     values: Mapping[str, float]
     text: str
-    increments: Mapping[str, float] | None = None
+    increments: Mapping[str, float] = field(default_factory=dict)
     when: When | None = None
+
+    def assignments(self) -> Iterator[tuple[str, float, bool]]:
+        """Each path with its number, and whether that is added to the present value."""
+        yield from ((path, value, False) for path, value in self.values.items())
+        yield from ((path, value, True) for path, value in self.increments.items())
 
 
 def boundary(t: float, h: float) -> int:

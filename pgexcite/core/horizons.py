@@ -146,12 +146,11 @@ class Horizons:
     def _changed(self, u: Array, p: Array, change: Change) -> tuple[Array, Array]:
         """Commands and parameters after a change; what this model does not have is left out."""
         u, p, index = u.copy(), p.copy(), self.model.index
-        for values, add in ((change.values, 0.0), (change.increments or {}, 1.0)):
-            for path, value in values.items():
-                for array, group in ((u, "u"), (p, "p")):
-                    if path in index[group]:
-                        k = index[group][path]
-                        array[k] = add * array[k] + value
+        for path, value, added in change.assignments():
+            for array, group in ((u, "u"), (p, "p")):
+                if path in index[group]:
+                    k = index[group][path]
+                    array[k] = array[k] + value if added else value
         return self._fixed(u), p
 
 

@@ -245,15 +245,14 @@ class Simulation:
 
     def _enter(self, change: Change, u: Array, p: Array) -> None:
         """Write a change into commands and parameters, and into the log."""
-        for values, add in ((change.values, False), (change.increments or {}, True)):
-            for path, value in values.items():
-                if name := switched(path):
-                    running = self._running[name]
-                    running.active, running.ordered = value > 0, True
-                    continue
-                array, group = (u, "u") if path in self.model.index["u"] else (p, "p")
-                k = self.model.position(group, path)
-                array[k] = array[k] + value if add else value
+        for path, value, added in change.assignments():
+            if name := switched(path):
+                running = self._running[name]
+                running.active, running.ordered = value > 0, True
+                continue
+            array, group = (u, "u") if path in self.model.index["u"] else (p, "p")
+            k = self.model.position(group, path)
+            array[k] = array[k] + value if added else value
         moved = "" if abs(self.state.t - change.t) < 1e-9 else f" (asked for at t = {change.t:g} s)"
         self._history.note(self.state.t, "event", change.text + moved)
 

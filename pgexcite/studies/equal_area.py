@@ -222,7 +222,7 @@ def _stages(changes: Sequence[Change]) -> tuple[tuple[Change, ...], tuple[Change
 def _values(changes: Sequence[Change]) -> dict[str, float]:
     merged: dict[str, float] = {}
     for change in changes:
-        foreign = [p for p in (*change.values, *(change.increments or {})) if p.split(".")[0] not in TABLES]
+        foreign = [p for p, _, _ in change.assignments() if p.split(".")[0] not in TABLES]
         if foreign:
             raise EqualAreaError(f"{foreign[0]} changes with the fault ({change.text}); only the network may")
         merged.update(change.values)

@@ -34,13 +34,12 @@ def _known(horizons: Horizons) -> dict[str, Numbers]:
     index, known = horizons.model.index, horizons.problem.known
     begins, assignments = [0], []
     for change in known:
-        for values, add in ((change.values, 0.0), (change.increments or {}, 1.0)):
-            assignments += [
-                (float(group == "p"), float(index[group][path]), add, value)
-                for path, value in values.items()
-                for group in ("u", "p")
-                if path in index[group]
-            ]
+        assignments += [
+            (float(group == "p"), float(index[group][path]), float(added), value)
+            for path, value, added in change.assignments()
+            for group in ("u", "p")
+            if path in index[group]
+        ]
         begins.append(len(assignments))
     table = np.array(assignments, dtype=float).reshape(-1, 4)
     return {
