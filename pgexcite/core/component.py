@@ -122,6 +122,10 @@ class Component(BaseModel):
         """
         return {}
 
+    def remarks(self) -> tuple[str, ...]:
+        """What is valid about its parameters and yet likely not meant, a sentence each."""
+        return ()
+
     @property
     def longest_step(self) -> float:
         """Step, s, up to which its timers keep their pace; a prediction whose steps grow past it is refused."""

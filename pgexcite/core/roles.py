@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
@@ -111,6 +112,11 @@ class TapChanger(Component):
     regulates: Literal["to", "from"] = par("to", "-", "which of the transformer's buses has its voltage held")
 
     ratio = port_out("-", "ratio of the transformer, sending side over receiving side")
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Lowest and highest ratio."""
+        return 0.0, math.inf
 
     @property
     def _direction(self) -> int:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pgexcite import ConfigError, load
-from pgexcite.core.config import from_data, json_schema, merge
+from pgexcite.core.config import from_data, json_schema, merge, remarks
 from pgexcite.core.trace import Ending
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -339,3 +339,24 @@ def test_schema_knows_every_model():
     assert machine["additionalProperties"] is False
     assert schema["$defs"]["load.zip"]["required"] == ["bus", "P"]
     assert {"exciter.st1a", "controller.mpc", "source.infinite_bus"} <= set(schema["$defs"])
+
+
+def transforming(**tap_changer):
+    data = scenario()
+    data["bus"]["C"] = {}
+    changer = {"model": "oltc", **tap_changer}
+    data["transformer"] = {"T": {"from": "A", "to": "C", "X": 0.1, "tap": 0.95, "tap_changer": changer}}
+    return data
+
+
+@pytest.mark.parametrize("model", ["oltc", "continuous"])
+def test_a_ratio_beyond_its_tap_changer_is_refused(model):
+    """An automaton that starts below its lowest ratio would be stuck there without a word."""
+    data = transforming(model=model, tap_min=0.97)
+    assert "0.97 .. 1.2 (got 0.95)" in problems(data)["transformer.T.tap"]
+
+
+def test_a_dead_band_narrower_than_a_step_is_remarked():
+    assert remarks(from_data(transforming())) == []
+    told = "transformer.T.tap_changer: a dead band of +-0.004 pu is narrower than a step of 0.01 pu: taps may hunt"
+    assert remarks(from_data(transforming(half_deadband=0.004))) == [told]

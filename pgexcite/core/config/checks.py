@@ -15,6 +15,7 @@ from pgexcite.core.config.validate import Collector
 from pgexcite.core.declare import Kind
 from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, HandOver, LoadStep, ParameterStep, boundary
 from pgexcite.core.limiting import mismatches
+from pgexcite.core.roles import TapChanger
 from pgexcite.core.system import Device, System
 
 EVENTS: dict[str, type[BaseModel]] = {
@@ -65,6 +66,22 @@ def check_limiters(system: System, collect: Collector) -> None:
     for device in system.devices:
         for found in mismatches(device):
             collect.add(found.path, found.message, hint=found.hint)
+
+
+def check_taps(system: System, collect: Collector) -> None:
+    """A transformer's own ratio is one its tap changer can have: outside its range an automaton is stuck."""
+    changers = {device.path: device.components.get("tap_changer") for device in system.devices}
+    for name, transformer in system.transformers.items():
+        path = f"transformer.{name}"
+        changer = changers.get(path)
+        if isinstance(changer, TapChanger):
+            low, high = changer.reach
+            if not low <= transformer.tap <= high:
+                collect.add(
+                    f"{path}.tap",
+                    f"must lie within its tap changer's tap_min .. tap_max = {low:g} .. {high:g}",
+                    transformer.tap,
+                )
 
 
 def check_reference(reference: str, grid: Grid, collect: Collector) -> None:

@@ -6,10 +6,12 @@ from pgexcite.core.config.scenario import Scenario
 
 
 def remarks(scenario: Scenario) -> list[str]:
-    """A sentence each: reactances below zero, and events that the run ends before."""
+    """A sentence each: reactances below zero, what components say, and events that the run ends before."""
     branches = scenario.system.branches()
     negative = [(path, branch.X) for path, branch in branches.items() if branch.X < 0]
     found = [f"{path}.X = {X:g} is negative, as that of a series capacitor" for path, X in negative]
+    parts = [(d.component_path(slot), c) for d in scenario.system.devices for slot, c in d.components.items()]
+    found += [f"{path}: {text}" for path, component in parts for text in component.remarks()]
     end = scenario.settings.t_end
     late = [change for change in scenario.changes if change.when is None and change.t > end]
     return found + [f"the run ends at {end:g} s, before {change.text} (t = {change.t:g} s)" for change in late]

@@ -88,6 +88,7 @@ def from_data(data: Mapping[str, Any], path: Path | str = "") -> Scenario:
     if not devices.broken:  # what is left out would make its neighbours look like an island
         checks.check_islands(system, collect)
         checks.check_limiters(system, collect)
+        checks.check_taps(system, collect)
     checks.check_reference(system.reference, grid, collect)
     events = _events(document.event, grid, simulation.h if simulation else None, collect)
     controllers = _controllers(document.controller, grid, simulation.h if simulation else None, collect)

@@ -37,6 +37,10 @@ class ContinuousTapChanger(TapChanger):
 
     moved = state("pu", "change of the ratio since the start")
 
+    @property
+    def reach(self) -> tuple[float, float]:
+        return self.tap_min, self.tap_max
+
     def equations(self, v: Signals) -> Equations:
         error = deadband(magnitude(v.v_re, v.v_im) - self.V_ref, self.half_deadband)
         drive = self._direction * (1 - self.blocked) * error

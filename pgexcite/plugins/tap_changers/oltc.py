@@ -58,9 +58,20 @@ class OLTC(TapChanger):
 
     error_before = before("pu", "deviation of the voltage at the beginning of a step")
 
+    def remarks(self) -> tuple[str, ...]:
+        if 2 * self.half_deadband >= self.step:
+            return ()
+        return (
+            f"a dead band of +-{self.half_deadband:g} pu is narrower than a step of {self.step:g} pu: taps may hunt",
+        )
+
     @property
     def longest_step(self) -> float:
         return self.T_next or math.inf
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        return self.tap_min, self.tap_max
 
     def equations(self, v: Signals) -> Equations:
         error = magnitude(v.v_re, v.v_im) - self.V_ref

@@ -28,7 +28,7 @@ class FieldTransfer(Transfer):
     Not modelled: the exciter's inner states do not track; what they would do differently is in the bias while it fades.
     """
 
-    source: ClassVar[str] = "IEEE Std 421.2-2014, clause 5.2 (transfer between regulators); bias by construction"
+    source: ClassVar[str] = "IEEE Std 421.2-2014 (transfer between regulators); bias by construction"
     ordered = (("V_RMIN", "V_RMAX"),)
 
     T_B: float = par(0.5, "s", "time constant with which the difference fades after control is handed back", gt=0)
