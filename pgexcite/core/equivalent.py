@@ -184,6 +184,13 @@ class Equivalent:
         return places | {"e_fd": self._e_fd, "x_s": self._x_s}
 
     @property
+    def inertia(self) -> float:
+        """Torque, pu, that changes the speed by 1 pu in a second: ``2 H``, s."""
+        initial = self.initial
+        mass = self.kernel.functions.prepare(FROZEN, initial.state.d, initial.state.u, initial.p)[1]
+        return float(mass[self._rotor[self.layout.omega]])
+
+    @property
     def rotor(self) -> tuple[int, ...]:
         """Where in ``x`` it puts the rotor's states, in the order of ``layout.rotor``."""
         return tuple(self._rotor)

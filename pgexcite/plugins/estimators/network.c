@@ -88,8 +88,9 @@ static void ukf_settle(void) {
     ukf_turned = 0;
 }
 
-/* State and covariance with the network as last settled, turned as the rotor has since, uncertain by a jump; the rotor is jolted. */
-static void ukf_changed(const double *jump, double *x, double *P) {
+/* State and covariance with the network as last settled, turned as the rotor has since, uncertain by a jump; the rotor is
+   jolted, the more the more power the change made. */
+static void ukf_changed(const double *jump, double power, double *x, double *P) {
     double turn[9] = {1, 0, 0, 0, 0, 0, 0, 0, 0}, half[9], bus[4];
     double *network = x + UKF_X_S, *block = P + UKF_X_S * UKF_N + UKF_X_S;
     int i, k, m;
@@ -114,5 +115,5 @@ static void ukf_changed(const double *jump, double *x, double *P) {
     ukf_wandered(network + 1, jump[UKF_JUMP_DELTA], jump[UKF_JUMP_V_BUS], bus, 2);
     for (i = 0; i < 2; i++)
         for (k = 0; k < 2; k++) block[(1 + i) * UKF_N + 1 + k] += bus[i * 2 + k];
-    for (i = 0; i < UKF_ROTOR; i++) P[i * UKF_N + i] += UKF_JOLT[i];
+    for (i = 0; i < UKF_ROTOR; i++) P[i * UKF_N + i] += UKF_JOLT[i] + UKF_LATE[i] * (power * power);
 }

@@ -46,7 +46,7 @@ static int ukf_judge(const double *z, Expectation *now, double *surprise, int *c
     ukf_unexplained += UKF_DT;
     ukf_anew = ukf_anew > 0 ? UKF_WARM_UP : 0;
     for (k = 0; k < UKF_N_JUMPS; k++) {
-        ukf_changed(UKF_JUMPS + UKF_JUMP_SIZE * k, x, P);
+        ukf_changed(UKF_JUMPS + UKF_JUMP_SIZE * k, z[UKF_P_E] - now->z[UKF_P_E], x, P);
         if (!ukf_draw(x, P, sigmas)) return 0;
         ukf_expect(sigmas, &other);
         left = ukf_surprise(&other, z);

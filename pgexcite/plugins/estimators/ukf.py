@@ -47,10 +47,17 @@ _STEADY = 0.3
 _RESTLESS = 20.0
 """Factor on the random walk of the bus's frequency while measurements are not quite as expected: without an infinite bus it moves
 whenever load or generation does."""
-_LATE_FLUX = 3e-3
-"""What a change somewhere within the last sample adds to the deviation of the fluxes, which do not jump, pu."""
-_LATE_OMEGA = 2.0
+_JOLT_FLUX = 3e-3
+"""What a change of the network adds to the deviation of the fluxes, which do not jump, pu."""
+_JOLT_OMEGA = 2.0
 """The same of the speed, in standard deviations of its measurement."""
+_LATE = 3**-0.5
+"""Share of the last sample for which a change had been there already, root mean square: any share is as likely."""
+_LATE_FLUX = 0.05
+"""What a pu of power that was there for the whole sample does to the fluxes, pu: ``X'_d - X''_d`` is some 0.1, and a subtransient
+time constant lets half of it come."""
+
+_P_E = TERMINALS.index("p_e")
 
 _TOLD = (
     "x_s",
@@ -150,6 +157,9 @@ class _Tracker:
         self.layout = layout = equivalent.layout
         self._start, self._omega_0 = equivalent.start, 2 * np.pi * equivalent.f_n
         self._omega, self._bus, self._fluxes = layout.omega, layout.bus, np.arange(len(layout.rotor)) != layout.omega
+        # Variances that a change of the network adds to the rotor's states: always, and for each squared pu of power it made.
+        self._jolt = np.where(self._fluxes, _JOLT_FLUX, _JOLT_OMEGA * options.noise_omega) ** 2
+        self._late = (_LATE * np.where(self._fluxes, _LATE_FLUX, dt / equivalent.inertia)) ** 2
         lower, upper = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
         lower[layout.x_s], upper[layout.x_s] = options.x_s_min, options.x_s_max
         lower[layout.bus], upper[layout.bus] = -options.v_bus_max, options.v_bus_max
@@ -249,7 +259,9 @@ class _Tracker:
         self._anew = options.warm_up if self._anew > 0 else 0.0
         for k, jump in enumerate(_JUMPS):
             x, P = self._network.changed(jump)
-            P[: self._fluxes.size, : self._fluxes.size] += np.diag(self._jolt())
+            P[: self._fluxes.size, : self._fluxes.size] += np.diag(
+                self._jolt + self._late * (z[_P_E] - expected.z[_P_E]) ** 2
+            )
             other = self._kalman.expect(x, P)
             left = other.surprise(z)
             if left <= options.limit:
@@ -257,10 +269,6 @@ class _Tracker:
                 self._since, self._moving, self._mean = 0.0, options.hold_after, float(len(TERMINALS))
                 return other, left, k + 1
         return expected, surprise, -1
-
-    def _jolt(self) -> Array:
-        """What a change of the network does to the variances of the rotor's states, beyond what the model says."""
-        return np.asarray(np.where(self._fluxes, _LATE_FLUX, _LATE_OMEGA * self.options.noise_omega) ** 2)
 
     def _correct(self, expected: Expectation, z: Array) -> None:
         kalman, network, options = self._kalman, self._network, self.options
@@ -339,6 +347,7 @@ class _Tracker:
             "omega_bus": layout.omega_bus,
             "x_s": layout.x_s,
             "bus": layout.bus.start,
+            "p_e": _P_E,
             "dt": self._dt,
             "omega_0": self._omega_0,
             "scale": kalman.points_fn.scale,
@@ -371,7 +380,8 @@ class _Tracker:
             "share": kalman.share,
             "R": kalman.R.diagonal(),
             "walk": self._walk.diagonal(),
-            "jolt": self._jolt(),
+            "jolt": self._jolt,
+            "late": self._late,
             "jumps": np.array(_JUMPS),
             "restart_P": self._uncertain(),
             "start": self._start,
