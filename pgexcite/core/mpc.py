@@ -76,6 +76,7 @@ class Problem:
         steps: changes of ``V_ref`` that are not known before they happen, as ``(t, V_ref)`` in order of time.
         known: known disturbances to come.
         delayed: whether a plan takes one sample to compute: it is made for the sample after the one it is made in.
+        late: samples between the instant measurements are taken at and the one they are told at.
         fixed: set-points that hold while the controller is in charge (the field transfer's ``manual``).
     """
 
@@ -99,6 +100,7 @@ class Problem:
     steps: tuple[tuple[float, Array], ...] = ()
     known: tuple[Change, ...] = ()
     delayed: bool = False
+    late: int = 0
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     @property

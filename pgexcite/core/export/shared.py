@@ -69,6 +69,7 @@ def ladder(session: Ladder, measured: int) -> tuple[dict[str, object], dict[str,
         "max_age": session.options.max_age,
         "has_classical": int(session.actuator.has_classical),
         "delayed": int(session.problem.delayed),
+        "late": session.problem.late,
         "plausible": PLAUSIBLE,
         "moved_command": MOVED,
     }

@@ -78,6 +78,12 @@ class MPC(BaseModel):
     )
     disturbance_known: bool = Field(False, description="whether the events of the run are known in advance")
     delayed: bool = Field(False, description="whether a plan takes one sample to compute, and is made for the next")
+    known_delay: int = par(
+        0,
+        "-",
+        "samples by which it takes its measurements to be late; it predicts over them what it has commanded",
+        ge=0,
+    )
     active: bool = Field(True, description="whether it is in charge from the start, or on standby")
     measurement: Measurement = Field(Measurement(), description="what its instruments do")
     max_reuse: int = par(3, "-", "samples an old plan is followed when no new one is found", ge=0)
@@ -119,7 +125,10 @@ class MPC(BaseModel):
             )
         if not self.blocks and self.N_c > self.N_p:
             raise ValueError(f"N_c = {self.N_c} must not exceed N_p = {self.N_p}")
-        self._backend()
+        if self.information == "perfect" and self.known_delay:
+            raise ValueError(
+                f"known_delay = {self.known_delay}, but the state that backend {self.backend!r} is told is never late"
+            )
         return self
 
     def _lengths(self) -> dict[str, int]:
@@ -243,5 +252,6 @@ class MPC(BaseModel):
             steps=tuple((t, each(value, n_v)) for t, value in sorted(self.V_ref_steps, key=itemgetter(0))),
             known=known,
             delayed=self.delayed,
+            late=self.known_delay,
             fixed=actuator.engaged,
         )

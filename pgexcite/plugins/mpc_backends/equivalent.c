@@ -3,26 +3,29 @@
    Goes below shooting.c and an estimator. The equivalent's field voltage is OFFSET above the plant's: commands and bounds are the
    equivalent's inside, the plant's outside. */
 
-/* The field voltage as seen in the last two samples and as sent last, pu of the plant. */
-static double field_before, field_seen, field_sent;
-static int was_in_charge;
+/* The field voltage as seen in the last two samples, pu of the plant. */
+static double field_before, field_seen;
+
+/* Command, and whether in charge, in each sample since the last measurements. */
+static double under_way[LATE + 1][2];
 
 /* The equivalent's field voltage since the last sample, of which `field` was measured at the end. */
 static double since_last(int whole, double field) {
     double first = field_before, before = field_seen;
     field_before = field_seen;
-    field_seen = whole ? field : field_sent;
+    field_seen = whole ? field : under_way[0][0];
     /* In charge it was constant. A regulator moved it: the mean of the parabola through the last three. */
-    return (was_in_charge ? field_seen : (5 * field_seen + 8 * before - first) / 12) + OFFSET;
+    return (under_way[0][1] > 0 ? field_seen : (5 * field_seen + 8 * before - first) / 12) + OFFSET;
 }
 
 /* Keep what is in force until the next sample. */
 static void send(const double *command) {
-    if (fabs(command[0]) <= PLAUSIBLE) field_sent = command[0];
+    if (fabs(command[0]) <= PLAUSIBLE) under_way[LATE][0] = command[0];
 }
 
-/* The equivalent at the estimate; 0 where its equations have no solution there. */
-static int locate(Point *at, double *p) {
+/* The equivalent at the estimate, carried on to the present under what was commanded since; 0 where its equations have no
+   solution. */
+static int locate(Point *at, double t, double *p) {
     static double u[AT_LEAST_1(N_U)];
     const double *bus = estimator_value + N_ROTOR + 3;
     int i;
@@ -35,13 +38,23 @@ static int locate(Point *at, double *p) {
     u[AT_P_M] = estimator_value[N_ROTOR];
     u[AT_E_FD] = field_seen + OFFSET;
     p[AT_X_S] = estimator_value[N_ROTOR + 2];
-    return settle_at(at, u, p) && all_finite(at->x, N_X) && all_finite(at->z, N_Z) && all_finite(u, N_U) && all_finite(p, N_P);
+    if (!settle_at(at, u, p)) return 0;
+    /* The last row is of the sample to come by now. */
+    for (i = 0; i < LATE; i++) {
+        double command = under_way[i][0] + OFFSET;
+        if (!advance(at, t, p, &command)) return 0;
+    }
+    return all_finite(at->x, N_X) && all_finite(at->z, N_Z) && all_finite(at->u, N_U) && all_finite(p, N_P);
 }
 
 void ${name}_reset(void) {
+    int i;
     has_plan = prepared = has_origin = 0;
-    field_before = field_seen = field_sent = FIELD_0;
-    was_in_charge = 0;
+    field_before = field_seen = FIELD_0;
+    for (i = 0; i <= LATE; i++) {
+        under_way[i][0] = FIELD_0;
+        under_way[i][1] = 0;
+    }
     ladder_reset();
     estimator_reset();
 }
@@ -54,13 +67,15 @@ void ${name}_step(const ${name}_input *in, ${name}_output *out) {
     ladder_look(in->measured, measured);
     whole = all_finite(measured, N_MEASURED);
     sound = estimator_observe(whole ? measured : NULL, since_last(whole, measured[N_MEASURED - 1]));
-    was_in_charge = in->active;
+    memmove(under_way, under_way[1], LATE * sizeof under_way[0]);
+    if (LATE > 0) under_way[LATE][0] = under_way[LATE - 1][0];
+    under_way[LATE][1] = in->active;
     if (DELAYED) send(in->u_last);
     has_origin = 0;
     out->iterations = 0;
     out->cost = INFINITY;
     out->status = ${NAME}_STATE_UNKNOWN;
-    if (sound && all_finite(&in->t, 1) && all_finite(&u_last, 1) && locate(&at, p))
+    if (sound && all_finite(&in->t, 1) && all_finite(&u_last, 1) && locate(&at, in->t, p))
         out->status = plan_from(&at, in->t, p, &u_last, found, &out->cost, &out->iterations);
     if (out->status <= ${NAME}_ITERATED && ladder_is_stale()) out->status = ${NAME}_STALE;
     ladder_answer(in->active, &u_last, out->status <= ${NAME}_ITERATED, found, out);

@@ -41,7 +41,8 @@ class EquivalentMPC(BaseModel):
     The prediction is that of ``nmpc``, of another network: the rest of the grid is an infinite bus behind ``x_s``. Nothing to come
     is known but changes of ``V_ref``. Angles are against the equivalent bus, and so is the speed in the cost.
 
-    With ``delayed`` measurements the estimate is of the instant they were taken at.
+    The estimate is of the instant the measurements were taken at. Over the ``known_delay`` of the controller it is carried on to
+    the present, under the commands sent since.
 
     Not modelled: other units, loads, the reaction of the turbine, the exciter's ceiling (bound the command instead).
     """
@@ -97,8 +98,9 @@ class _Equivalent(Shooting):
         super().__init__(self._equivalent.kernel, own, shooting, rule="tr_bdf2", h=h, grid=surroundings.h)
         self._offset = self._equivalent.offset
         self._bounds = float(problem.u_min[0]), float(problem.u_max[0])
-        self._before = self._seen = self._sent = np.array([surroundings.y_0[self._field]])
-        self._in_charge = False
+        self._before = self._seen = np.array([surroundings.y_0[self._field]])
+        # Commands, and whether in charge, in each sample since the last measurements.
+        self._sent, self._in_charge = np.tile(self._seen, (problem.late + 1, 1)), np.zeros(problem.late + 1)
         self._told: Mapping[str, float] = {}
 
     # The protocol of a solver: commands of the plant outside, of the equivalent inside.
@@ -107,50 +109,62 @@ class _Equivalent(Shooting):
         """The plan from this sample on; see ``pgexcite.core.mpc.Solver``."""
         solution = super().solve(sample, u_last + self._offset)
         if self.problem.delayed:
-            self._sent = np.array(u_last)
+            self._sent[-1] = u_last
         return replace(solution, u=solution.u - self._offset, diagnostics=self._told)
 
     def prepare(self, u: Array) -> None:
         """Keep what was sent: it is in force until the next sample, but where there is computing delay."""
         if not self.problem.delayed:
-            self._sent = np.array(u)
+            self._sent[-1] = u
 
     def memory(self) -> Mapping[str, Array]:
         """Plan, estimate, and the field voltages seen and sent last."""
-        own = as_arrays({"before": self._before, "seen": self._seen, "sent": self._sent, "in_charge": self._in_charge})
+        own = as_arrays(
+            {"before": self._before, "seen": self._seen, "sent": self._sent.copy(), "in_charge": self._in_charge}
+        )
         return {**super().memory(), **own, **under("observer", self._observer.memory())}
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
         super().recall(memory)
-        self._before, self._seen, self._sent = memory["before"], memory["seen"], memory["sent"]
-        self._in_charge = bool(memory["in_charge"] > 0)
+        self._before, self._seen = memory["before"], memory["seen"]
+        self._sent, self._in_charge = memory["sent"].copy(), memory["in_charge"]
         self._observer.recall(those_under("observer", memory))
 
     # Where the equivalent is.
 
     def locate(self, sample: Sample) -> State | None:
-        """The equivalent's state by the estimator; ``None`` where that has diverged."""
+        """The equivalent's state now, by the estimator; ``None`` where that has diverged."""
         terminals = np.array([sample.measured[path] for path in self._paths])
         field = np.array([sample.measured[self._field]])
         whole = bool(np.isfinite(terminals).all() and np.isfinite(field).all())
         estimate = self._observer.observe(terminals if whole else None, self._since_last(field if whole else None))
-        self._in_charge = sample.active
+        since = self._sent[1:]
+        self._sent = np.vstack((since, self._sent[-1]))
+        self._in_charge = np.append(self._in_charge[1:], float(sample.active))
         self._told = estimate.diagnostics
-        return self._settled(sample.t, estimate) if estimate.sound else None
+        return self._carried(self._settled(sample.t, estimate), since) if estimate.sound else None
 
     def _since_last(self, field: Array | None) -> float:
         """The equivalent's field voltage since the last sample, of which ``field`` was measured at the end."""
         first, before, self._before = self._before, self._seen, self._seen
-        self._seen = self._sent if field is None else field
+        self._seen = self._sent[0] if field is None else field
         # In charge it was constant. A regulator moved it: the mean of the parabola through the last three.
-        mean = self._seen if self._in_charge else (5 * self._seen + 8 * before - first) / 12
+        mean = self._seen if self._in_charge[0] > 0 else (5 * self._seen + 8 * before - first) / 12
         return float(mean[0]) + self._offset
 
     def _settled(self, t: float, estimate: Estimate) -> State | None:
         start = self._equivalent.initial.state
         x, u, self.p = self._equivalent.point(estimate.value, float(self._seen[0]) + self._offset)
         return self.kernel.settle(State(0, t, x, start.z, start.d, u), self.p)
+
+    def _carried(self, state: State | None, commands: Array) -> State | None:
+        """A state carried on under these commands of the plant, a sample each."""
+        for command in commands:
+            # Nothing in an equivalent is known to change at any time: the clock does not matter.
+            later = None if state is None else self._advance(state, state.t, command + self._offset, self.p)
+            state = later[0] if later else None
+        return state
 
     # As C.
 

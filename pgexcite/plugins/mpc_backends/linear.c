@@ -1,31 +1,41 @@
 /* Linear MPC with a Kalman filter on states and disturbances: the backend "linear". Goes below offset_free.c. */
 
-static double plan[N_V], sent[N_COMMANDS], since_t;
-static int has_plan, has_since, since_active, age;
+static double plan[N_V], since_t;
+static int has_plan, has_since, age;
+
+/* Commands, and whether in charge, in each sample since the measurements of the sample before this one. */
+static struct { double u[N_COMMANDS]; int active; } under_way[LATE + 1];
 
 /* From the initial point. */
 static void forget(void) {
-    int i;
+    int i, k;
     filter_reset();
     move_point(POINT_X, POINT_U);
-    for (i = 0; i < N_COMMANDS; i++) sent[i] = POINT_U[i] + U_BIAS[i];
+    for (k = 0; k <= LATE; k++) {
+        under_way[k].active = 0;
+        for (i = 0; i < N_COMMANDS; i++) under_way[k].u[i] = POINT_U[i] + U_BIAS[i];
+    }
     has_plan = has_since = age = 0;
 }
 
-/* Predicts to this sample and corrects by what was measured; whether the state is known now. */
+/* When the measurements told at t were taken. */
+static double taken_at(double t) { return t - LATE * DT; }
+
+/* Predicts to the instant of what was measured and corrects by it; whether the state is known there. */
 static int observe(double t, const double *measured, const double *u_last) {
     static Transition step;
     static double u[N_COMMANDS], push[AT_LEAST_1(N_X)], seen[N_SEEN];
     const double *y = Y_0, *to_y = TO_Y_0;
     int i;
     if (has_since) {
-        /* On standby the command moves between two samples; both ends are known. */
-        for (i = 0; i < N_COMMANDS; i++) u[i] = (since_active ? sent[i] : (sent[i] + u_last[i]) / 2) - U_BIAS[i];
+        /* On standby the command moves between two samples, and is measured as late as all else: both ends are known. */
+        for (i = 0; i < N_COMMANDS; i++)
+            u[i] = (under_way[0].active ? under_way[0].u[i] : (under_way[LATE].u[i] + u_last[i]) / 2) - U_BIAS[i];
         push_of(push);
-        if (!first_sample(since_t, mean, u, push, &step)) return 0;
+        if (!first_sample(taken_at(since_t), mean, u, push, &step)) return 0;
         filter_predict(&step);
         /* Measured after what is known to have changed at this instant; without it the change would count twice. */
-        if (changes_at(t)) outputs_at(t, u, &step);
+        if (changes_at(taken_at(t))) outputs_at(taken_at(t), u, &step);
         y = step.y;
         to_y = step.to_y;
     }
@@ -50,10 +60,12 @@ static int prediction(double t, const double *u_last, const double *around, doub
     static Transition step;
     static double push[AT_LEAST_1(N_X)], u[N_COMMANDS], moves[N_V];
     const double *x = mean;
-    int i, j;
+    int i, j, k;
     push_of(push);
-    if (DELAYED) {
-        for (i = 0; i < N_COMMANDS; i++) u[i] = u_last[i] - U_BIAS[i];
+    t = taken_at(t);
+    for (k = 1; k <= LATE + DELAYED; k++) {
+        const double *since = k <= LATE ? under_way[k].u : u_last;
+        for (i = 0; i < N_COMMANDS; i++) u[i] = since[i] - U_BIAS[i];
         if (!first_sample(t, x, u, push, &step)) return 0;
         x = step.x;
         t += DT;
@@ -113,7 +125,7 @@ void ${name}_reset(void) {
 void ${name}_step(const ${name}_input *in, ${name}_output *out) {
     static double measured[N_MEASURED], u_last[N_COMMANDS];
     int i;
-    for (i = 0; i < N_COMMANDS; i++) u_last[i] = all_finite(in->u_last + i, 1) ? in->u_last[i] : sent[i];
+    for (i = 0; i < N_COMMANDS; i++) u_last[i] = all_finite(in->u_last + i, 1) ? in->u_last[i] : under_way[LATE].u[i];
     ladder_look(in->measured, measured);
     out->iterations = 0;
     out->cost = INFINITY;
@@ -128,9 +140,10 @@ void ${name}_step(const ${name}_input *in, ${name}_output *out) {
         }
         has_since = 1;
         since_t = in->t;
-        since_active = in->active;
     }
-    memcpy(sent, u_last, sizeof sent);
+    memmove(under_way, under_way + 1, LATE * sizeof under_way[0]);
+    memcpy(under_way[LATE].u, u_last, sizeof u_last);
+    under_way[LATE].active = in->active;
     for (i = N_X; i < N_MEAN; i++) out->estimate[i - N_X] = mean[i];
     out->estimate[N_MEAN - N_X] = surprise;
     if (out->status <= ${NAME}_ITERATED && ladder_is_stale()) out->status = ${NAME}_STALE;
@@ -138,5 +151,5 @@ void ${name}_step(const ${name}_input *in, ${name}_output *out) {
 }
 
 void ${name}_prepare(const double *command) {
-    if (!DELAYED && all_finite(command, N_COMMANDS)) memcpy(sent, command, sizeof sent);
+    if (!DELAYED && all_finite(command, N_COMMANDS)) memcpy(under_way[LATE].u, command, sizeof under_way[LATE].u);
 }

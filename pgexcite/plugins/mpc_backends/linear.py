@@ -68,7 +68,7 @@ class Linear(BaseModel):
     instant on over the horizon; one that is renewed once a second follows the operating point and not every swing.
 
     Not modelled: a limit inside the model (a ceiling, a non-windup limit) is as it stands at the point of linearisation; discrete
-    states stay as at the initial point; measurements are taken for fresh, whatever their delay.
+    states stay as at the initial point.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -117,8 +117,9 @@ class _Linear:
     """
 
     _plan: Array | None
-    _since: Array | None  # when the sample before this one was, and whether it was in charge
-    _u: Array  # the plant's commands in force since then
+    _since: float | None  # when the sample before this one was
+    _u: Array  # the plant's commands in each sample since that one's measurements, a row each
+    _in_charge: Array  # whether it was in charge in each of them
     _age: int  # samples since the model was linearised
 
     def __init__(self, options: Linear, problem: ControlProblem, surroundings: Surroundings) -> None:
@@ -217,28 +218,33 @@ class _Linear:
             solution = self._planned(sample.t, u_last)
         else:
             solution = self._failed(Status.STATE_UNKNOWN, u_last)
-        self._since, self._u = np.array([sample.t, float(sample.active)]), u_last
+        self._since = sample.t
+        self._u = np.vstack((self._u[1:], u_last))
+        self._in_charge = np.append(self._in_charge[1:], float(sample.active))
         times = {"locate": 1e3 * (located - began), "feedback": 1e3 * (time.perf_counter() - located)}
         return replace(solution, times_ms=times, diagnostics=self._diagnostics())
 
     def prepare(self, u: Array) -> None:
         """Keep what was sent: it is in force until the next sample."""
         if not self.problem.delayed:
-            self._u = u
+            self._u[-1] = u
 
     def memory(self) -> Mapping[str, Array]:
         """Estimate, plan, and the point of linearisation."""
         point = {name: getattr(self._local.point, name) for name in ("x", "z", "u")}
         maybe = {"plan": self._plan, "since": self._since}
-        kept = {"u": self._u, "age": self._age, **{key: value for key, value in maybe.items() if value is not None}}
+        own = {"u": self._u.copy(), "in_charge": self._in_charge, "age": self._age}
+        kept = own | {key: value for key, value in maybe.items() if value is not None}
         return as_arrays(kept) | under("filter", self.filter.memory()) | under("point", point)
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off; from the initial point where it is empty."""
         self.filter.recall(those_under("filter", memory))
         self._local.move(self._point_0.with_(**those_under("point", memory)))
-        self._plan, self._since = memory.get("plan"), memory.get("since")
-        self._u = memory.get("u", self._point_0.u[self._commands] + self._u_bias)
+        self._plan, self._since = memory.get("plan"), float(memory["since"]) if "since" in memory else None
+        rows = self.problem.late + 1
+        self._u = memory.get("u", np.tile(self._point_0.u[self._commands] + self._u_bias, (rows, 1))).copy()
+        self._in_charge = memory.get("in_charge", np.zeros(rows))
         self._age = int(memory.get("age", 0))
 
     def parts(self, where: str, measured: Sequence[str]) -> Parts:
@@ -291,20 +297,20 @@ class _Linear:
     # Where the model is.
 
     def _observe(self, sample: Sample, u_last: Array) -> bool:
-        """Predict to this sample and correct by what was measured; whether the state is known now."""
-        y, C = self._y_0, self._C_0
+        """Predict to the instant of what was measured and correct by it; whether the state is known there."""
+        y, C, t = self._y_0, self._C_0, self._taken_at(sample.t)
         if self._since is not None:
-            began, in_charge = self._since
-            # On standby the command moves between two samples; both ends are known.
-            u = self._u if in_charge > 0 else (self._u + u_last) / 2
-            step = self._local.sample(self._horizon(float(began)), self.filter.x, u - self._u_bias, self.filter.push)
+            # On standby the command moves between two samples, and is measured as late as all else: both ends are known.
+            u = self._u[0] if self._in_charge[0] > 0 else (self._u[-1] + u_last) / 2
+            began = self._taken_at(self._since)
+            step = self._local.sample(self._horizon(began), self.filter.x, u - self._u_bias, self.filter.push)
             if step is None:
                 return False
             self.filter.predict(step)
             y, C = step.y, step.C
-            if self._horizons.changes_at(sample.t):
+            if self._horizons.changes_at(t):
                 # Measured after what is known to have changed at this instant; without it the change would count twice.
-                after = self._horizons.until(sample.t, self._u_0, self._p_0)
+                after = self._horizons.until(t, self._u_0, self._p_0)
                 y, C = self._local.outputs(step.x, u - self._u_bias, *after) or (y, C)
         measured = np.array([sample.measured[path] for path in self._measured])
         # An instrument is broken: not believed, and not taken for a lost measurement. (From the ladder it comes as one.)
@@ -315,6 +321,10 @@ class _Linear:
             self.recall({})
             return False
         return True
+
+    def _taken_at(self, t: float) -> float:
+        """When the measurements told at ``t`` were taken, s."""
+        return t - self.problem.late * self.problem.dt
 
     def _linearise(self, u_last: Array) -> None:
         """Move the point of linearisation to the estimate, where it is time."""
@@ -361,8 +371,9 @@ class _Linear:
 
     def _prediction(self, t: float, u_last: Array) -> Linearised | None:
         x, push = self.filter.x, self.filter.push
-        if self.problem.delayed:
-            step = self._local.sample(self._horizon(t), x, u_last - self._u_bias, push)
+        t = self._taken_at(t)
+        for u in (*self._u[1:], *([u_last] if self.problem.delayed else ())):
+            step = self._local.sample(self._horizon(t), x, u - self._u_bias, push)
             if step is None:
                 return None
             x, t = step.x, t + self.problem.dt

@@ -115,6 +115,8 @@ def test_refusals_name_the_place():
         run(dt=0.052)
     with pytest.raises(ConfigError, match="nearest"):
         run(unit="G3")
+    with pytest.raises(ValidationError, match="known_delay = 1, but the state"):
+        MPC(unit="G2", known_delay=1)
     with pytest.raises(ValidationError, match="N_c = 9"):
         MPC(unit="G2", N_c=9)
     with pytest.raises(ValidationError, match="nmpc"):

@@ -38,6 +38,11 @@ CASES = {
     "many moves": (FAULT, ["controller.mpc.N_p=12", "controller.mpc.N_c=12"]),
     "standby and take-over": (FAULT, ["controller.mpc.active=false", HANDED_OVER]),
     "delayed, samples lost": (LINE_TRIP, ["controller.mpc.delayed=true", LOST]),
+    "late and known": (FAULT, ["controller.mpc.measurement.delay=2", "controller.mpc.known_delay=2"]),
+    "late and known, delayed, samples lost": (
+        LINE_TRIP,
+        ["controller.mpc.delayed=true", LOST, "controller.mpc.measurement.delay=1", "controller.mpc.known_delay=1"],
+    ),
     "nobody behind it, most samples lost": (
         SMIB / "fault_nmpc.toml",
         ["controller.mpc.backend=equivalent", "controller.mpc.measurement={loss=0.6}", *NO_PATIENCE],
@@ -64,10 +69,10 @@ def test_its_commands_and_estimates_are_those_of_python(case, tmp_path):
     assert figures["samples with another number of iterations"] == 0
 
 
-@pytest.mark.parametrize("delayed", [False, True])
-def test_in_whatever_trouble_it_does_what_python_does(delayed, tmp_path):
+@pytest.mark.parametrize("more", ["delayed=false", "delayed=true", "known_delay=2"])
+def test_in_whatever_trouble_it_does_what_python_does(more, tmp_path):
     """Through losses, hanging transmitters, wild samples, restarts and changes of who is in charge."""
-    case = scenario(FAULT, f"controller.mpc.delayed={str(delayed).lower()}")
+    case = scenario(FAULT, f"controller.mpc.{more}")
     export_c(case, tmp_path)
     levels = exported.record_trouble(case, tmp_path, ["unit.G2.v_t", "unit.G2.p_e"], 600)
     assert min(levels.count(level) for level in (0, 1, 2)) > 20

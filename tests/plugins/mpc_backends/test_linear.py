@@ -200,6 +200,21 @@ def test_computing_delay_is_compensated():
     assert costs[0] < costs[1] < 1.01 * costs[0]  # measured 1.0046
 
 
+@pytest.mark.parametrize("controller", [{}, {"delayed": True}, {"relinearise": "once"}])
+def test_a_delay_that_is_known_is_made_up_for(controller):
+    """A step of the reference that meets a right model: what is predicted over the delay is what happens."""
+    options = {key: controller[key] for key in controller if key == "relinearise"}
+    rest = {key: controller[key] for key in controller if key != "relinearise"} | {"V_ref_steps": ((0.3, 1.005),)}
+    late = Measurement(delay=2)
+    prompt, known, unknown = (
+        run(t_end=2.0, options=options, **rest, **more)
+        for more in ({}, {"measurement": late, "known_delay": 2}, {"measurement": late})
+    )
+    gaps = [np.abs(sim.trace()["unit.G2.v_t"] - prompt.trace()["unit.G2.v_t"]).max() for sim in (known, unknown)]
+    assert gaps[0] < 1e-4
+    assert gaps[1] > 10 * gaps[0]
+
+
 # When the model is linearised.
 
 
@@ -327,6 +342,7 @@ def test_nonsense_is_not_followed_and_not_kept():
         ({"relinearise": "once"}, {}),
         ({"relinearise": "every"}, {"disturbance_known": True}),
         ({"relinearise": "scheduled", "every": 7}, {"delayed": True}),
+        ({}, {"known_delay": 1}),
     ],
 )
 def test_a_resumed_run_goes_on_to_the_last_bit(tmp_path, options, controller):

@@ -53,6 +53,12 @@ CASES = {
     "noise, samples lost": (FAULT, [NOISE, "controller.mpc.options.sigma=2e-3"]),
     "most samples lost": (FAULT, ["simulation.t_end=12", LOST, *IMPATIENT]),
     "most samples lost, delayed": (FAULT, ["simulation.t_end=12", LOST, *IMPATIENT, "controller.mpc.delayed=true"]),
+    "late and known": (FAULT, ["controller.mpc.measurement.delay=2", "controller.mpc.known_delay=2"]),
+    "late and known, delayed, samples lost": (
+        FAULT,
+        [LOST, "controller.mpc.delayed=true", "controller.mpc.measurement.delay=1", "controller.mpc.known_delay=1"],
+    ),
+    "known fault, late": (FAULT, [KNOWN, "controller.mpc.N_p=20", "controller.mpc.known_delay=1", EVERY]),
     "known fault": (FAULT, [KNOWN, "controller.mpc.N_p=20"]),
     "known fault, growth": (FAULT, [KNOWN, *GROWTH]),
     "standby and take-over": (FAULT, ["controller.mpc.active=false", HANDED_OVER]),
@@ -78,7 +84,10 @@ def test_its_commands_and_estimates_are_those_of_python(case, tmp_path):
     assert figures["samples with another number of iterations"] == 0
 
 
-@pytest.mark.parametrize("overrides", [[], ["controller.mpc.delayed=true"], [EVERY, SOFT, "controller.mpc.N_p=10"]])
+@pytest.mark.parametrize(
+    "overrides",
+    [[], ["controller.mpc.delayed=true"], ["controller.mpc.known_delay=1"], [EVERY, SOFT, "controller.mpc.N_p=10"]],
+)
 def test_in_whatever_trouble_it_does_what_python_does(overrides, tmp_path):
     """Through losses, hanging transmitters, wild samples, restarts and changes of who is in charge."""
     case = scenario(FAULT, *overrides)
