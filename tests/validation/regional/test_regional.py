@@ -224,7 +224,7 @@ def test_candidates_find_plans_that_descent_from_the_last_plan_does_not(tmp_path
         sim.resume(tmp_path / "at.npz")
         sim.run(until=40.1)
         costs.append(sim.trace()["controller.mpc.predicted_cost"][-1])
-    assert costs[1] < 0.9 * costs[0]  # measured 12.5 against 15.3
+    assert costs[1] < 0.9 * costs[0]  # measured 12.3 against 15.4
 
 
 def test_long_steps_of_a_prediction_make_the_taps_that_short_ones_make():
