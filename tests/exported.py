@@ -16,7 +16,6 @@ from pgexcite.core import codegen
 from pgexcite.core.config import Scenario
 from pgexcite.core.controller import Sample
 from pgexcite.core.export.recorder import Recorder
-from pgexcite.core.simulate import Simulation
 
 STRICT = ["-std=c99", "-O1", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-Wpedantic"]
 
@@ -143,12 +142,12 @@ def record_trouble(case: Scenario, directory: Path, signals: Sequence[str], n: i
 
 def session_of(case: Scenario) -> Any:
     """The controller of a scenario, at the start of a run."""
-    return Simulation(case.system, case.settings, case.changes, case.controllers).sessions["mpc"]
+    return case.simulation().sessions["mpc"]
 
 
 def _samples(case: Scenario) -> list[Sample]:
     """What the controller is handed in a run."""
-    simulation = Simulation(case.system, case.settings, case.changes, case.controllers)
+    simulation = case.simulation()
     session, samples = simulation.sessions["mpc"], []
     act = session.act
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pgexcite import Simulation, load
+from pgexcite import load
 from pgexcite.studies.measures import swing_damping
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -14,7 +14,7 @@ SCENARIOS = sorted(path for path in CONFIGS.rglob("*.toml") if not {"cases", "st
 
 def simulate(path, *overrides):
     scenario = load(path, overrides)
-    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation = scenario.simulation()
     return scenario, simulation.run(), simulation.trace()
 
 

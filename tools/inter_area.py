@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pgexcite import Simulation, load
+from pgexcite import load
 from pgexcite.core.trace import Trace
 from pgexcite.studies.figures import COLOURS, figure, save
 
@@ -40,7 +40,7 @@ FAULT: Mapping[str, tuple[str, Sequence[str]]] = {
 def run(name: str, overrides: Sequence[str]) -> Trace:
     """The trace of a scenario."""
     scenario = load(CONFIGS / f"{name}.toml", overrides)
-    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation = scenario.simulation()
     simulation.run()
     return simulation.trace()
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from pgexcite import Simulation
 from pgexcite.core.config import from_data, read
 from pgexcite.core.config.files import override
 from pgexcite.core.trace import Outcome, Trace
@@ -66,7 +65,7 @@ def run(name: str, overrides: Sequence[str] = (), mismatch: Mapping[str, float] 
         mpc = data["controller"]["mpc"]
         mpc["options"]["mismatch" if mpc["backend"] == "nmpc" else "model"] = dict(mismatch)
     scenario = from_data(data, path)
-    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation = scenario.simulation()
     outcome: Outcome = simulation.run()
     result = simulation.result()
     u = dict(zip(simulation.model.u_names, simulation.initial.state.u, strict=True))

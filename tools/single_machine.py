@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from pgexcite import Simulation
 from pgexcite.core.config import load
 from pgexcite.core.trace import Trace
 from pgexcite.studies.figures import draw_runs
@@ -68,7 +67,7 @@ COLUMNS = {
 def run(name: str) -> Trace:
     """One run, with instruments that do not err."""
     scenario = load(CONFIGS / f"{name}.toml", EXACT if name.startswith("fault_equivalent") else ())
-    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation = scenario.simulation()
     simulation.run()
     return simulation.trace()
 

@@ -45,7 +45,7 @@ def execute(
     Raises:
         PgexciteError: the run cannot start or its record cannot be written.
     """
-    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation = scenario.simulation()
     if resume is not None:
         simulation.resume(resume)
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as stack:
@@ -75,7 +75,7 @@ def execute_paced(scenario: Scenario, directory: Path, options: RealtimeOptions)
     Raises:
         PgexciteError: the run cannot start or its record cannot be written.
     """
-    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation = scenario.simulation()
     length = options.steps * simulation.sampling * scenario.settings.h or scenario.settings.t_end
     with _reporting(length) as report:
         timing = run_paced(simulation, options, report)

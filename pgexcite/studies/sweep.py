@@ -42,7 +42,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pgexcite.core.config import load, read
 from pgexcite.core.errors import ConfigError, PgexciteError, Problem
-from pgexcite.core.simulate import Simulation
 from pgexcite.core.summary import summarise
 from pgexcite.studies.cct import critical_clearing_time
 from pgexcite.studies.measures import swing_figures
@@ -160,7 +159,7 @@ def run_case(case: Case) -> dict[str, Any]:
     """Run a case and take its figures; what goes wrong by itself is a figure too (``error``)."""
     try:
         scenario = load(case.path, case.overrides)
-        simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+        simulation = scenario.simulation()
         simulation.run()
     except PgexciteError as error:
         return {"error": str(error)}

@@ -114,7 +114,7 @@ def scenario(N: int, t_end: float, **changes: Any) -> Any:
 def prepared(N: int, t_end: float, **changes: Any) -> tuple[Simulation, Any]:
     """A simulation at its start, and its controller's solver."""
     chosen = scenario(N, t_end, **changes)
-    simulation = Simulation(chosen.system, chosen.settings, chosen.changes, chosen.controllers)
+    simulation = chosen.simulation()
     return simulation, simulation.sessions["mpc"]
 
 

@@ -16,6 +16,7 @@ from pgexcite.core.config.validate import Collector, plain
 from pgexcite.core.errors import ConfigError
 from pgexcite.core.events import Change
 from pgexcite.core.settings import Settings
+from pgexcite.core.simulate import Simulation
 from pgexcite.core.system import System
 
 
@@ -44,6 +45,15 @@ class Scenario:
     sinks: tuple[str, ...]
     resolved: Mapping[str, Any]
     path: Path
+
+    def simulation(self) -> Simulation:
+        """Its run, at the start.
+
+        Raises:
+            PowerFlowError, InitialisationError, AssemblyError: there is no steady state to start from.
+            ConfigError: a controller refers to something that is not there.
+        """
+        return Simulation(self.system, self.settings, self.changes, self.controllers)
 
 
 def load(path: Path | str, overrides: Sequence[str] = ()) -> Scenario:

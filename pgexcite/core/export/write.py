@@ -16,7 +16,6 @@ from pgexcite.core.export import shared, text
 from pgexcite.core.export.parts import Exportable, Parts
 from pgexcite.core.export.recorder import Recorder
 from pgexcite.core.ladder import Ladder
-from pgexcite.core.simulate import Simulation
 
 _SHARED = ("dense.c", "qp.c", "condensed.c", "ladder.c")
 """What goes above the parts of every solver."""
@@ -54,7 +53,7 @@ def export_c(scenario: Scenario, directory: Path, controller: str = "") -> Expor
         ExportError: something else stands in the directory.
     """
     name = _chosen(scenario, controller)
-    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation = scenario.simulation()
     session = simulation.sessions[name]
     if not isinstance(session, Ladder) or not isinstance(session.solver, Exportable):
         raise ConfigError([Problem(f"controller.{name}", "cannot be exported: its backend offers no C")])

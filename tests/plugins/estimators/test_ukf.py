@@ -12,7 +12,6 @@ from pgexcite.core.config import load
 from pgexcite.core.controller import Surroundings
 from pgexcite.core.equivalent import TERMINALS, Equivalent
 from pgexcite.core.events import Change
-from pgexcite.core.simulate import Simulation
 from pgexcite.plugins.estimators.ukf import UKF
 
 CONFIGS = Path(__file__).parents[3] / "configs" / "smib"
@@ -25,7 +24,7 @@ EXACT = ("controller.mpc.measurement.noise=0.0", "controller.mpc.measurement.noi
 
 def simulation(name, *overrides, t_end=4.0):
     scenario = load(CONFIGS / f"{name}.toml", [f"simulation.t_end={t_end}", *overrides])
-    return Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    return scenario.simulation()
 
 
 def reseeded(sim, seed):

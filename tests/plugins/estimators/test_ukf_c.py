@@ -11,7 +11,6 @@ import pytest
 
 from pgexcite.core import codegen
 from pgexcite.core.config import load
-from pgexcite.core.simulate import Simulation
 from pgexcite.plugins.estimators.ukf import UKF
 
 CONFIGS = Path(__file__).parents[3] / "configs" / "smib"
@@ -49,7 +48,7 @@ class Filters:
 
     def __init__(self, name, folder, *overrides):
         scenario = load(CONFIGS / f"{name}.toml", ["simulation.t_end=4", *overrides])
-        simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+        simulation = scenario.simulation()
         solver = simulation.sessions["mpc"].solver
         self.equivalent, observer = solver._equivalent, solver._observer
         self.written, self.fed = observer.written(), []

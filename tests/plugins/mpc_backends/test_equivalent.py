@@ -169,7 +169,7 @@ def test_over_a_fault_it_does_nearly_what_the_perfect_model_does():
     traces = {}
     for name in ("st1a", "nmpc", "equivalent"):
         scenario = load(CONFIGS / "smib" / f"fault_{name}.toml", ["simulation.t_end=5"])
-        sim = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+        sim = scenario.simulation()
         assert sim.run().ending.value == "completed"
         traces[name] = sim.trace()
     areas = {name: area(trace) for name, trace in traces.items()}
@@ -222,7 +222,7 @@ def test_a_delay_that_is_known_is_made_up_for():
     damping = []
     for overrides in ([], [late], [late, "controller.mpc.known_delay=1"]):
         scenario = load(CONFIGS / "smib" / "fault_equivalent_damped.toml", ["simulation.t_end=6", *exact, *overrides])
-        sim = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+        sim = scenario.simulation()
         assert sim.run().ending.value == "completed"
         damping.append(swing_figures(sim.trace(), "G2")["damping"])
     prompt, unknown, known = damping
@@ -351,7 +351,7 @@ def test_with_weights_that_damp_the_swing_dies_away_sooner_than_under_the_stabil
     path = CONFIGS / "smib" / "fault_equivalent_damped.toml"
     exact = ["controller.mpc.measurement.noise=0.0", "controller.mpc.measurement.noise_omega=0.0"]
     scenario = load(path, ["simulation.t_end=6", f"line.L1.X={line}", *exact])
-    sim = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    sim = scenario.simulation()
     assert sim.run().ending.value == "completed"
     assert swing_figures(sim.trace(), "G2")["damping"] > least
 
@@ -361,7 +361,7 @@ def test_with_weights_that_damp_the_swing_dies_away_sooner_than_under_the_stabil
 
 def test_on_open_circuit_it_steps_the_voltage_as_if_there_were_no_grid():
     scenario = load(CONFIGS / "smib" / "open_circuit_equivalent.toml", ["simulation.t_end=4"])
-    sim = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    sim = scenario.simulation()
     assert sim.run().ending.value == "completed"
     trace = sim.trace()
     v = trace["unit.G2.v_t"]

@@ -10,7 +10,6 @@ from pgexcite.core.config import from_data, load
 from pgexcite.core.realtime import timed
 from pgexcite.core.record import read_trace, write_record
 from pgexcite.core.recording import entity
-from pgexcite.core.simulate import Simulation
 from pgexcite.core.timing import PHASES, Timing
 from pgexcite.core.trace import Trace
 from pgexcite.plugins.sinks.config import ConfigSink
@@ -47,7 +46,7 @@ def test_the_recording_holds_the_trace(synthetic_run, tmp_path):
 
 def test_the_recording_of_a_real_run_equals_its_parquet_file(tmp_path):
     scenario = load(ST1A, ["simulation.t_end=2.0"])
-    simulation = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    simulation = scenario.simulation()
     simulation.run()
     result = simulation.result(scenario.title, scenario.resolved)
     sinks = [ConfigSink(), ParquetSink(), SummarySink(), RerunSink()]

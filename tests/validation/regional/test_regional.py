@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pgexcite import Simulation, load
+from pgexcite import load
 from pgexcite.core.prediction import Horizon, Predictor
 from pgexcite.core.step import Kernel
 from pgexcite.studies.long_term import Watched, commands_of, long_term_figures
@@ -23,7 +23,7 @@ RATED = {"A2G1": 1.925, "A2G2": 1.925, "A3G1": 1.811}
 
 def simulation(path, *overrides):
     scenario = load(path, overrides)
-    return Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    return scenario.simulation()
 
 
 @functools.cache
@@ -104,7 +104,7 @@ def resident():
 @functools.cache
 def claim(name, *overrides):
     scenario = load(CONFIGS / f"{name}.toml", overrides)
-    sim = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    sim = scenario.simulation()
     outcome = sim.run()
     u = dict(zip(sim.model.u_names, sim.initial.state.u, strict=True))
     watched = Watched("Load", "Balsfjord", "transformer.OLTC.tap_changer", RATED, commands_of(scenario.controllers, u))

@@ -14,7 +14,6 @@ from plants import push
 
 from pgexcite.core.config import load
 from pgexcite.core.linearise import linearise
-from pgexcite.core.simulate import Simulation
 from pgexcite.studies.ringdown import mode_near, ringdown_modes
 from pgexcite.studies.sampled_modes import sampled_modes
 
@@ -27,7 +26,7 @@ UNITS = (1, 2, 3, 4)
 
 def simulation(name, *overrides):
     scenario = load(CONFIGS / f"{name}.toml", overrides)
-    return Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    return scenario.simulation()
 
 
 def run(name, *overrides):
