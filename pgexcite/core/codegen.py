@@ -8,11 +8,13 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import platform
 import re
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ from pgexcite.core.errors import PgexciteError
 Array = NDArray[np.float64]
 
 FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off", "-w")
-"""Without contraction into fused multiply-adds the numbers are those of the virtual machine."""
+"""Without contraction into fused multiply-adds the numbers are those of the virtual machine, with whatever vectors there are."""
 
 _LOOPS = Path(__file__).parent / "c"
 
@@ -42,6 +44,16 @@ def compiler() -> str | None:
     return None
 
 
+@cache
+def processor() -> tuple[tuple[str, ...], str]:
+    """Flags for this processor's own vectors, and what tells it from others: a library with them must not run elsewhere."""
+    known = Path("/proc/cpuinfo")
+    if platform.machine() not in ("x86_64", "AMD64") or not known.exists():
+        return (), ""
+    features = next((line for line in known.read_text(errors="replace").splitlines() if line.startswith("flags")), "")
+    return ("-march=native",), features
+
+
 def cache_directory() -> Path:
     """Where compiled libraries are kept: ``$PGEXCITE_CACHE``, else the user's cache directory."""
     chosen = os.environ.get("PGEXCITE_CACHE")
@@ -51,18 +63,25 @@ def cache_directory() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "pgexcite"
 
 
-def generate(functions: Sequence[ca.Function], constants: Mapping[str, object], loops: Sequence[str]) -> str:
+def generate(
+    functions: Sequence[ca.Function],
+    constants: Mapping[str, object],
+    loops: Sequence[str],
+    along: Sequence[ca.Function] = (),
+) -> str:
     """C source of these functions and of loops around them.
 
     Args:
         functions: what the loops call.
         constants: what the loops need to know.
         loops: files of ``c``, in order: ``step.c`` and ``advance.c`` take steps (``Kernel.stepping``; ``land``), ``rollout.c`` and
-            ``chain.c`` predict (the four of ``pgexcite.core.prediction.write_sensitivities``).
+            ``chain.c`` predict (``pgexcite.core.sensitivity.Sensitivities``).
+        along: what the loops call with several directions at a time, see ``write_along``.
     """
     sizes = {key: max(1, *(getattr(f, key)() for f in functions)) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}
     values = {"pgexcite_public": "", **constants, **sizes}
-    return "\n".join([write_functions(functions), define(values), *(loop(name) for name in loops)])
+    lanes = [loop("lanes.c"), *map(write_along, along)] if along else []
+    return "\n".join([write_functions(functions), define(values), *lanes, *(loop(name) for name in loops)])
 
 
 def define(constants: Mapping[str, object]) -> str:
@@ -148,6 +167,60 @@ def _body(text: str, *, called: bool) -> str:
     return text.replace("{\n", "\n".join(start), 1)
 
 
+_LINEAR = {
+    ca.OP_ADD: "{} + {}",
+    ca.OP_SUB: "{} - {}",
+    ca.OP_MUL: "{} * {}",
+    ca.OP_DIV: "{} / {}",
+    ca.OP_NEG: "-{}",
+    ca.OP_TWICE: "2.0 * {}",
+    ca.OP_IF_ELSE_ZERO: "({}) ? {} : ({})",
+    ca.OP_ASSIGN: "{}",
+}
+
+
+def write_along(function: ca.Function) -> str:
+    """C of ``(factors, direction, ...) -> derivative`` for as many directions at a time as there are lanes.
+
+    ``void name(const double *from0, const lanes *from1, ..., lanes *to)``. Lane for lane the operations are those of the function.
+
+    Raises:
+        CompilationError: the function is not linear in its directions.
+    """
+    lines: list[str] = []
+    values: dict[int, tuple[str, bool]] = {}
+    for k in range(function.n_instructions()):
+        operation, to, of = function.instruction_id(k), function.instruction_output(k), function.instruction_input(k)
+        if operation == ca.OP_CONST:
+            values[to[0]] = (number(function.instruction_constant(k)), False)
+        elif operation == ca.OP_INPUT:
+            values[to[0]] = (f"from{of[0]}[{of[1]}]", of[0] > 0)
+        elif operation == ca.OP_OUTPUT:
+            name, wide = values[of[0]]
+            lines.append(f"to[{to[1]}] = {name if wide else f'{name} + none'};")
+        else:
+            operands = [values[i] for i in of]
+            wide = any(is_wide for _, is_wide in operands)
+            lines.append(f"const {'lanes' if wide else 'double'} v{k} = {_linear(function, operation, operands)};")
+            values[to[0]] = (f"v{k}", wide)
+    arguments = [f"const {'lanes' if i else 'double'} *restrict from{i}" for i in range(function.n_in())]
+    unused = " ".join(f"(void)from{i};" for i in range(function.n_in()))
+    start = f"static void {function.name()}({', '.join(arguments)}, lanes *restrict to) {{"
+    return "\n".join([start, "const lanes none = {0};", f"{unused} (void)none;", *lines, "}\n"])
+
+
+def _linear(function: ca.Function, operation: int, operands: list[tuple[str, bool]]) -> str:
+    """An operation on operands by name, each with whether it has lanes."""
+    names = [f"({name})" if name.startswith("-") else name for name, _ in operands]
+    wide = [is_wide for _, is_wide in operands]
+    kept = operation in (ca.OP_MUL, ca.OP_DIV, ca.OP_IF_ELSE_ZERO)
+    if operation not in _LINEAR or (kept and all(wide)) or (operation == ca.OP_DIV and wide[1]):
+        raise CompilationError(f"{function.name()}: is not linear in its directions")
+    if operation == ca.OP_IF_ELSE_ZERO:
+        names.append("none" if wide[1] else "0.0")
+    return _LINEAR[operation].format(*names)
+
+
 def build(source: str, *, only_cached: bool = False) -> Path | None:
     """Compile a source, or take the library compiled from the same source before.
 
@@ -157,8 +230,8 @@ def build(source: str, *, only_cached: bool = False) -> Path | None:
     Raises:
         CompilationError: no compiler, or it failed.
     """
-    cc = compiler()
-    key = hashlib.sha256("\0".join((source, *FLAGS, cc or "")).encode()).hexdigest()[:24]
+    cc, (native, features) = compiler(), processor()
+    key = hashlib.sha256("\0".join((source, *FLAGS, *native, features, cc or "")).encode()).hexdigest()[:24]
     target = cache_directory() / f"{key}.so"
     if target.exists():
         return target
@@ -173,7 +246,7 @@ def build(source: str, *, only_cached: bool = False) -> Path | None:
             unit.write_text(source)
             built = Path(folder) / target.name
             done = subprocess.run(
-                [cc, *FLAGS, str(unit), "-o", str(built), "-lm"], capture_output=True, text=True, check=False
+                [cc, *FLAGS, *native, str(unit), "-o", str(built), "-lm"], capture_output=True, text=True, check=False
             )
             if done.returncode != 0:
                 raise CompilationError(f"{cc} failed: {done.stderr.strip()[:500]}")

@@ -11,18 +11,17 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.codegen import build, generate, load
-from pgexcite.core.hoist import hoist, jacobian
 from pgexcite.core.model import State
+from pgexcite.core.sensitivity import Along, write_sensitivities
 from pgexcite.core.settings import Rule
 from pgexcite.core.stage import ALPHA, BETA, FROZEN
-from pgexcite.core.step import RULES, STARTUP_STEPS, Kernel, bind
+from pgexcite.core.step import RULES, STARTUP_STEPS, Bound, Kernel, bind
 
 Array = NDArray[np.float64]
 
@@ -132,7 +131,7 @@ class Predictor:
         n_x, n_u = kernel.x.size, len(commands)
         self.transitions = n_x < (n_moves - 1) * n_u if transitions is None else transitions
         columns = n_x + n_u if self.transitions else n_moves * n_u
-        self._functions = write_sensitivities(kernel, self._commands, self._outputs, columns)
+        self.sensitivities = write_sensitivities(kernel, self._commands, self._outputs)
         self._library = self._compile(columns)
         rows = (kernel.w.size, n_x, n_u, self._outputs.size)
         # CasADi keeps matrices column by column, so a row of these arrays is a column of the sensitivity.
@@ -140,6 +139,7 @@ class Predictor:
         self._S_new, self._S_slope = np.zeros_like(self._S), np.zeros_like(self._S_b)
         self._w, self._b, self._y = np.zeros(kernel.w.size), np.zeros(n_x), np.zeros(self._outputs.size)
         self._sensing = [_Sensing(self) for _ in range(2)]
+        self._commanded = _Commanded(self)
         self._commands_at = _address(self._commands)
         self._call = _Call([np.zeros(n) for n in (n_x, kernel.z.size, kernel.d.size)], n_moves * n_u)
 
@@ -147,9 +147,13 @@ class Predictor:
         if not self._kernel.compiled:
             return None
         sizes = {"n_commands": self._commands.size, "n_columns": columns, "n_selected": self._outputs.size}
-        sizes |= {"transition": int(self.transitions), "n_sense_hoisted": self._functions[0].numel_out(0)}
-        called, loops = [*self._kernel.stepping(), *self._functions], ["step.c", "rollout.c", "chain.c"]
-        library = build(generate(called, self._kernel.constants() | sizes, loops))
+        sizes |= {"transition": int(self.transitions)}
+        written, loops = self.sensitivities, ["step.c", "rollout.c", "chain.c"]
+        constants, called = (
+            self._kernel.constants() | written.constants(),
+            [*self._kernel.stepping(), *written.functions()],
+        )
+        library = build(generate(called, constants | sizes, loops, written.along()))
         return None if library is None else load(library)
 
     def roll(self, state: State, moves: Array, horizon: Horizon, *, derivatives: bool) -> Rollout | None:
@@ -284,11 +288,25 @@ class Predictor:
         u[self._commands] = move
         changed = moved or not np.array_equal(u, kernel.u)
         if changed:
-            here = State(0, 0.0, kernel.x, kernel.z, kernel.d, u)
-            kernel.begin(here, horizon.p[row])
+            if moved or self.sensitivities.commands_mass:
+                kernel.begin(State(0, 0.0, kernel.x, kernel.z, kernel.d, u), horizon.p[row])
+            else:
+                self._command(u)
             if not kernel.settle_here():
                 return None
         return changed
+
+    def _command(self, u: Array) -> None:
+        """Put other commands in force, all else as it was: of what is hoisted, what depends on them alone is computed anew."""
+        kernel, written, commanded = self._kernel, self.sensitivities, self._commanded
+        kernel.u[:] = u
+        for c, q in kernel.hoisted():
+            commanded.of(c)
+            q[written.of_kernel] = commanded.of_kernel
+        for sensing in self._sensing:
+            if sensing.of[0] == kernel.renewals:
+                commanded.of(sensing.of[1])
+                sensing.q[written.of_own] = commanded.of_own
 
     def _point_at(self, move: int, *, fresh: bool) -> None:
         """Directions of the sensitivities: the commands of a move, or each state and each command by itself."""
@@ -362,16 +380,47 @@ class _Sensing:
     """
 
     def __init__(self, predictor: Predictor) -> None:
-        k, s = predictor._kernel, predictor
-        prepare, stage, slope, output = s._functions
-        self.of, self.c, q = (-1, np.nan), np.zeros(1), np.zeros(prepare.numel_out(0))
+        k, s, written = predictor._kernel, predictor, predictor.sensitivities
+        columns = s._S.shape[0]
+        self.of, self.c, self.q = (-1, np.nan), np.zeros(1), np.zeros(written.prepare.numel_out(0))
+        self.prepare = bind(written.prepare, [self.c, k.d, k.u, k.p], [self.q])
         S, S_b, S_c, S_y, S_new, S_slope = (a.reshape(-1) for a in (s._S, s._S_b, s._S_c, s._S_y, s._S_new, s._S_slope))
-        self.prepare = bind(prepare, [self.c, k.d, k.u, k.p], [q])
-        self.stage = bind(stage, [k.w, k.b, q, S_b, S_c], [S_new])
-        self.middle = bind(stage, [k.middle, k.b_middle, q, S_b, S_c], [S_new])
-        self.settled = bind(stage, [s._w, s._b, q, S_b, S_c], [S_new])
-        self.slope = bind(slope, [k.start, q, S, S_c], [S_slope])
-        self.outputs = bind(output, [s._w, q, k.d, S, S_c], [s._y, S_y])
+
+        def along(of: Along, point: list[Array], beside: list[Array], directions: list[Array], to: Array) -> _Along:
+            factors = np.zeros(of.size)
+            return _Along(bind(of.at, point, [*beside, factors]), bind(of.of(columns), [factors, *directions], [to]))
+
+        self.stage = along(written.stage, [k.w, k.b, self.q], [], [S_b, S_c], S_new)
+        self.middle = along(written.stage, [k.middle, k.b_middle, self.q], [], [S_b, S_c], S_new)
+        self.settled = along(written.stage, [s._w, s._b, self.q], [], [S_b, S_c], S_new)
+        self.slope = along(written.slope, [k.start, self.q], [], [S, S_c], S_slope)
+        self.outputs = along(written.output, [s._w, self.q, k.d], [s._y], [S, S_c], S_y)
+
+
+class _Commanded:
+    """What depends on the commands of the values hoisted, by coefficient ``c``."""
+
+    def __init__(self, predictor: Predictor) -> None:
+        k, written = predictor._kernel, predictor.sensitivities
+        self._c, self.of_kernel, self.of_own = (np.zeros(n) for n in (1, written.of_kernel.size, written.of_own.size))
+        self._compute = bind(written.commanded, [self._c, k.d, k.u, k.p], [self.of_kernel, self.of_own])
+
+    def of(self, c: float) -> None:
+        """Compute them."""
+        self._c[0] = c
+        self._compute.trigger()
+
+
+class _Along(NamedTuple):
+    """A derivative bound to its arrays: what it takes from the point, and along all directions."""
+
+    at: Bound
+    columns: Bound
+
+    def trigger(self) -> None:
+        """Compute it."""
+        self.at.trigger()
+        self.columns.trigger()
 
 
 class _Call:
@@ -402,41 +451,3 @@ class _Call:
 
 def _address(array: NDArray[Any]) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
-
-
-def write_sensitivities(
-    kernel: Kernel, commands: NDArray[np.int32], outputs: NDArray[np.int32], columns: int
-) -> tuple[ca.Function, ca.Function, ca.Function, ca.Function]:
-    """Derivatives of a stage, of the slope and of the selected outputs to ``columns`` moves.
-
-    ``prepare_sensitivity(c, d, u, p) -> q``, ``stage_sensitivity(w, b, q, S_b, S_c) -> S_w``,
-    ``slope_sensitivity(w, q, S_w, S_c) -> S_slope`` and ``output_sensitivity(w, q, d, S_w, S_c) -> (y, S_y)``;
-    ``S_c`` has a row for each command.
-    """
-    stage, n_x, factors = kernel.stage, kernel.x.size, kernel.functions.factors
-    assert factors is not None, "too large to be written out"
-    S_w, S_b = ca.SX.sym("S_w", stage.w.numel(), columns), ca.SX.sym("S_b", n_x, columns)
-    S_c = ca.SX.sym("S_c", commands.size, columns)
-    # The commands act through what is hoisted.
-    by_command = ca.jacobian(stage.values, stage.u[commands.tolist()])
-    acting = sorted(set(by_command.sparsity().row()))
-
-    def by_commands(expression: ca.SX) -> ca.SX:
-        return ca.mtimes(ca.mtimes(ca.jacobian(expression, stage.q[acting]), by_command[acting, :]), S_c)
-
-    def along(expression: ca.SX) -> ca.SX:
-        return ca.densify(ca.mtimes(jacobian(expression, stage.w), S_w) + by_commands(expression))
-
-    y = stage.y[outputs.tolist()]
-    rhs = ca.mtimes(ca.jacobian(stage.r, stage.b), S_b) + by_commands(stage.r)
-    solved = -ca.densify(factors.solve(rhs, kernel.functions.pairing))
-    fixed = [stage.q, stage.c, stage.d[np.flatnonzero(stage.switching).tolist()], stage.u, stage.p]
-    hoisted = hoist([solved, along(stage.slope), y, along(y)], fixed)
-    S_next, S_slope, y, S_y = hoisted.expressions
-    w, q, options = stage.w, hoisted.q, {"cse": True}
-    return (
-        ca.Function("prepare_sensitivity", stage.parameters, stage.in_parameters([hoisted.values]), options),
-        ca.Function("stage_sensitivity", [w, stage.b, q, S_b, S_c], [S_next], options),
-        ca.Function("slope_sensitivity", [w, q, S_w, S_c], [S_slope], options),
-        ca.Function("output_sensitivity", [w, q, stage.d, S_w, S_c], [y, S_y], options),
-    )

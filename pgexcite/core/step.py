@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -245,6 +245,10 @@ class Kernel:
 
     # One step at a time, on the work arrays.
 
+    def hoisted(self) -> Iterator[tuple[float, Array]]:
+        """Coefficients, and what is hoisted out of stages with them, as far as that is of the present parameters."""
+        return ((with_.of[1], with_.q) for with_ in self._prepared if with_.of[0] == self.renewals)
+
     def begin(self, state: State, p: Array) -> None:
         """Go to a state."""
         present = zip((self.d, self.u, self.p), (state.d, state.u, p), strict=True)
@@ -367,11 +371,14 @@ class Kernel:
         return False
 
     def settle_here(self) -> bool:
-        """Solve ``z`` again at fixed ``x``."""
+        """Solve ``z`` again at fixed ``x``, unless it is solved."""
         self.aim(FROZEN)
         np.multiply(self.mass, self.x, out=self.b)
         self.w[:] = self._here
         self._landed = False
+        self._with.check[0].trigger()
+        if self._norm2[0] < VERIFIED * VERIFIED:
+            return True
         if not self._solve():
             return False
         self._here[:] = self.w
@@ -406,7 +413,8 @@ class _Prepared:
 
     def __init__(self, kernel: Kernel) -> None:
         functions, k = kernel.functions, kernel
-        q, self.reach = np.zeros(functions.prepare.numel_out(0)), np.zeros(k.x.size)
+        self.q = q = np.zeros(functions.prepare.numel_out(0))
+        self.reach = np.zeros(k.x.size)
         self.of = (-1, np.nan)
         self.prepare = bind(functions.prepare, [k.c, k.d, k.u, k.p], [q, k.mass, self.reach])
         points = (k.w, k._w_next)

@@ -79,7 +79,7 @@ def _operations(r: ca.SX, w: ca.SX, idle: ca.SX) -> tuple[dict[int, dict[int, Sl
             ends[to[1]] = values[of[0]].unknown
         else:
             operands = [values[i] for i in of]
-            expression = _apply(operation, [operand.expression for operand in operands])
+            expression = apply(operation, [operand.expression for operand in operands])
             row: dict[int, Slope] = {}
             for operand, (slope, online) in zip(operands, _slopes(operation, operands, expression), strict=True):
                 j = operand.unknown
@@ -92,7 +92,8 @@ def _operations(r: ca.SX, w: ca.SX, idle: ca.SX) -> tuple[dict[int, dict[int, Sl
     return rows, ends
 
 
-def _apply(operation: int, operands: list[ca.SX]) -> ca.SX:
+def apply(operation: int, operands: list[ca.SX]) -> ca.SX:
+    """One of CasADi's elementary operations by its number."""
     return ca.SX.unary(operation, *operands) if len(operands) == 1 else ca.SX.binary(operation, *operands)
 
 
@@ -114,7 +115,7 @@ def _slopes(operation: int, operands: list[_Value], value: ca.SX) -> list[Slope]
         return [(inverse, b.online), (-value * inverse, a.online or b.online)]
     if operation not in _DERIVATIVES:
         symbols = [ca.SX.sym("a") for _ in operands]
-        result = _apply(operation, symbols)
+        result = apply(operation, symbols)
         slopes = [ca.densify(ca.jacobian(result, symbol)) for symbol in symbols]
         _DERIVATIVES[operation] = ca.Function("slopes", symbols, slopes)
     slopes = _DERIVATIVES[operation].call([operand.expression for operand in operands], True, False)

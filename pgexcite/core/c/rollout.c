@@ -1,10 +1,13 @@
-/* Predictions with exact sensitivities: the loop of pgexcite.core.prediction, operation by operation. Goes below step.c.
+/* Predictions with exact sensitivities: the loop of pgexcite.core.prediction, operation by operation. Goes below step.c and lanes.c.
 
-   Expects prepare_sensitivity, stage_sensitivity, slope_sensitivity and output_sensitivity. */
+   Expects what pgexcite.core.sensitivity writes: prepare_sensitivity, prepare_commanded, and of a stage, of its slope and of the
+   outputs the factors at a point and the derivative along a direction. */
 
-static double S[N_W * N_COLUMNS], S_next[N_W * N_COLUMNS], S_b[AT_LEAST_1(N_X) * N_COLUMNS], S_c[N_COMMANDS * N_COLUMNS];
-static double S_slope[AT_LEAST_1(N_X) * N_COLUMNS];
-static double S_y[N_SELECTED * N_COLUMNS];
+static lanes S[N_BLOCKS][N_W], S_next[N_BLOCKS][N_W], S_b[N_BLOCKS][AT_LEAST_1(N_X)], S_c[N_BLOCKS][N_COMMANDS];
+static lanes S_slope[N_BLOCKS][AT_LEAST_1(N_X)], S_y[N_BLOCKS][N_SELECTED];
+
+/* Element i of column k. */
+#define ELEMENT(of, k, i) (((double *)of[(k) / LANES])[(i) * LANES + (k) % LANES])
 
 /* What is hoisted out of the sensitivities, as in Prepared. */
 static struct {
@@ -23,39 +26,78 @@ static const double *sense_aim(Stage *s, double c) {
     return sensing[k].q;
 }
 
-static void sense_stage(const double *q, const double *w, const double *b, double *to) {
-    args[0] = w; args[1] = b; args[2] = q; args[3] = S_b; args[4] = S_c;
-    results[0] = to;
-    stage_sensitivity(args, results, iwork, work, 0);
+/* Renews of what is hoisted with coefficient c what depends on the commands, alone. */
+static void renew_commanded(Stage *s, double c, double *of_kernel, double *of_own) {
+    static const int at[] = COMMANDED, own_at[] = SENSE_COMMANDED;
+    static double values[AT_LEAST_1(N_COMMANDED)], own[AT_LEAST_1(N_SENSE_COMMANDED)];
+    int i;
+    args[0] = &c; args[1] = s->d; args[2] = s->u; args[3] = s->p;
+    results[0] = values; results[1] = own;
+    prepare_commanded(args, results, iwork, work, 0);
+    if (of_kernel)
+        for (i = 0; i < N_COMMANDED; i++) of_kernel[at[i]] = values[i];
+    if (of_own)
+        for (i = 0; i < N_SENSE_COMMANDED; i++) of_own[own_at[i]] = own[i];
+}
+
+/* Other commands, all else as it was. */
+static void commanded(Stage *s) {
+    int k;
+    for (k = 0; k < 2; k++) {
+        int stage = s->prepared[k].of == s->renewals, own = sensing[k].of == s->renewals;
+        double c = stage ? s->prepared[k].c : sensing[k].c;
+        if (stage && own && sensing[k].c != c) own = 0, sensing[k].of = 0;
+        if (stage || own) renew_commanded(s, c, stage ? s->prepared[k].q : NULL, own ? sensing[k].q : NULL);
+    }
+    s->sloped = 0;
+}
+
+static void sense_stage(const double *q, const double *w, const double *b, lanes to[N_BLOCKS][N_W]) {
+    static double factors[AT_LEAST_1(N_STAGE_FACTORS)];
+    int k;
+    args[0] = w; args[1] = b; args[2] = q;
+    results[0] = factors;
+    stage_factors(args, results, iwork, work, 0);
+    for (k = 0; k < N_BLOCKS; k++) stage_along(factors, S_b[k], S_c[k], to[k]);
+}
+
+static void sense_slope(const double *q, const double *w) {
+    static double factors[AT_LEAST_1(N_SLOPE_FACTORS)];
+    int k;
+    args[0] = w; args[1] = q;
+    results[0] = factors;
+    slope_factors(args, results, iwork, work, 0);
+    for (k = 0; k < N_BLOCKS; k++) slope_along(factors, S[k], S_c[k], S_slope[k]);
 }
 
 /* S_b of mass * (alpha A - beta B). */
-static void scale_by_mass(Stage *s, double alpha, const double *A, double beta, const double *B) {
+static void scale_by_mass(Stage *s, double alpha, lanes A[N_BLOCKS][N_W], double beta, lanes B[N_BLOCKS][N_W]) {
     int i, k;
-    for (k = 0; k < N_COLUMNS; k++)
-        for (i = 0; i < N_X; i++) S_b[k * N_X + i] = s->mass[i] * (alpha * A[k * N_W + i] - beta * B[k * N_W + i]);
+    for (k = 0; k < N_BLOCKS; k++)
+        for (i = 0; i < N_X; i++) S_b[k][i] = s->mass[i] * (alpha * A[k][i] - beta * B[k][i]);
+}
+
+/* S_b of mass * S. */
+static void weigh(Stage *s) {
+    int i, k;
+    for (k = 0; k < N_BLOCKS; k++)
+        for (i = 0; i < N_X; i++) S_b[k][i] = s->mass[i] * S[k][i];
 }
 
 static void sense_step(Stage *s, int rule, int euler) {
     const double *q = sense_aim(s, s->c);
     int i, k;
-    if (rule == 2 || euler) {
-        scale_by_mass(s, 1, S, 0, S);
-        sense_stage(q, s->w[0], s->b, S_next);
-    } else {
-        args[0] = s->start; args[1] = q; args[2] = S; args[3] = S_c;
-        results[0] = S_slope;
-        slope_sensitivity(args, results, iwork, work, 0);
-        for (k = 0; k < N_COLUMNS; k++)
-            for (i = 0; i < N_X; i++) S_b[k * N_X + i] = s->mass[i] * S[k * N_W + i] + s->c * S_slope[k * N_X + i];
-        if (rule == 1) {
-            sense_stage(q, s->w[0], s->b, S_next);
-        } else {
+    weigh(s);
+    if (rule != 2 && !euler) {
+        sense_slope(q, s->start);
+        for (k = 0; k < N_BLOCKS; k++)
+            for (i = 0; i < N_X; i++) S_b[k][i] += s->c * S_slope[k][i];
+        if (rule == 0) {
             sense_stage(q, s->middle, s->b_middle, S_next);
             scale_by_mass(s, ALPHA, S_next, BETA, S);
-            sense_stage(q, s->w[0], s->b, S_next);
         }
     }
+    sense_stage(q, s->w[0], s->b, S_next);
     memcpy(S, S_next, sizeof S);
 }
 
@@ -63,18 +105,24 @@ static void sense_settling(Stage *s, const double *x, const double *z) {
     int i;
     memcpy(s->start, x, sizeof(double) * N_X); memcpy(s->start + N_X, z, sizeof(double) * N_Z);
     for (i = 0; i < N_X; i++) s->b[i] = s->mass[i] * x[i];
-    scale_by_mass(s, 1, S, 0, S);
+    weigh(s);
     sense_stage(sense_aim(s, FROZEN), s->start, s->b, S_next);
     memcpy(S, S_next, sizeof S);
 }
 
-/* Selected outputs and their derivatives. */
+/* Selected outputs and their derivatives, column by column. */
 static void sense_outputs(Stage *s, const double *x, const double *z, double *y, double *to_y) {
+    static double factors[AT_LEAST_1(N_OUTPUT_FACTORS)];
     const double *q = sense_aim(s, s->c);
+    int k, i;
     memcpy(s->start, x, sizeof(double) * N_X); memcpy(s->start + N_X, z, sizeof(double) * N_Z);
-    args[0] = s->start; args[1] = q; args[2] = s->d; args[3] = S; args[4] = S_c;
-    results[0] = y; results[1] = to_y;
-    output_sensitivity(args, results, iwork, work, 0);
+    args[0] = s->start; args[1] = q; args[2] = s->d;
+    results[0] = y; results[1] = factors;
+    output_factors(args, results, iwork, work, 0);
+    if (!to_y) return;
+    for (k = 0; k < N_BLOCKS; k++) output_along(factors, S[k], S_c[k], S_y[k]);
+    for (k = 0; k < N_COLUMNS; k++)
+        for (i = 0; i < N_SELECTED; i++) to_y[k * N_SELECTED + i] = ELEMENT(S_y, k, i);
 }
 
 /* Directions of the sensitivities at the start of a piece: the commands of its move; of a sample also, if transitions are wanted,
@@ -85,10 +133,10 @@ static void point_at(int move, int fresh_sample) {
     memset(S_c, 0, sizeof S_c);
     if (TRANSITION) {
         memset(S, 0, sizeof S);
-        for (i = 0; i < N_X; i++) S[i * N_W + i] = 1;
-        for (i = 0; i < N_COMMANDS; i++) S_c[(N_X + i) * N_COMMANDS + i] = 1;
+        for (i = 0; i < N_X; i++) ELEMENT(S, i, i) = 1;
+        for (i = 0; i < N_COMMANDS; i++) ELEMENT(S_c, N_X + i, i) = 1;
     } else {
-        for (i = 0; i < N_COMMANDS; i++) S_c[(move * N_COMMANDS + i) * N_COMMANDS + i] = 1;
+        for (i = 0; i < N_COMMANDS; i++) ELEMENT(S_c, move * N_COMMANDS + i, i) = 1;
     }
 }
 
@@ -99,24 +147,27 @@ PGEXCITE_PUBLIC int pgexcite_rollout(int rule, int N, const int *count, const do
                                      const double *p_rows, const double *u_rows, const double *moves, int derivatives, double *y,
                                      double *dy, double *dx) {
     static Stage s;
-    static double u[AT_LEAST_1(N_U)], u_last[AT_LEAST_1(N_U)];
-    int j, i, k, sample = 0, fresh = 1;
-    memcpy(u_last, u_rows, sizeof(double) * N_U);
-    s.d = d; s.u = u_last; s.p = p_rows;
+    static double u[AT_LEAST_1(N_U)], wanted[AT_LEAST_1(N_U)];
+    int j, k, i, sample = 0, fresh = 1;
+    memcpy(u, u_rows, sizeof u);
+    s.d = d; s.u = u; s.p = p_rows;
     renewed(&s);
     aim(&s, FROZEN);
     memset(S, 0, sizeof S); memset(S_c, 0, sizeof S_c);
     for (j = 0; j < N; j++) {
-        int changed = j > 0 && row[j] != row[j - 1];
-        memcpy(u, u_rows + (long)row[j] * N_U, sizeof(double) * N_U);
-        for (i = 0; i < N_COMMANDS; i++) u[commands[i]] = moves[move[j] * N_COMMANDS + i];
-        for (i = 0; i < N_U; i++) changed |= u[i] != u_last[i];
-        s.u = u; s.p = p_rows + (long)row[j] * N_P;
+        int other = j > 0 && row[j] != row[j - 1], changed = other;
+        memcpy(wanted, u_rows + (long)row[j] * N_U, sizeof wanted);
+        for (i = 0; i < N_COMMANDS; i++) wanted[commands[i]] = moves[move[j] * N_COMMANDS + i];
+        for (i = 0; i < N_U; i++) changed |= wanted[i] != u[i];
         if (changed) {
-            renewed(&s);
+            memcpy(u, wanted, sizeof u);
+            s.p = p_rows + (long)row[j] * N_P;
+            if (other || COMMANDS_MASS)
+                renewed(&s);
+            else
+                commanded(&s);
             if (!settle(&s, x, z)) return j;
             startup = STARTUP_STEPS;
-            memcpy(u_last, u, sizeof(double) * N_U);
         }
         if (derivatives && (fresh || changed)) {
             point_at(move[j], fresh);
@@ -134,9 +185,10 @@ PGEXCITE_PUBLIC int pgexcite_rollout(int rule, int N, const int *count, const do
         }
         fresh = end[j];
         if (!end[j]) continue;
-        sense_outputs(&s, x, z, y + sample * N_SELECTED, derivatives ? dy + (long)sample * N_SELECTED * N_COLUMNS : S_y);
+        sense_outputs(&s, x, z, y + sample * N_SELECTED, derivatives ? dy + (long)sample * N_SELECTED * N_COLUMNS : NULL);
         if (derivatives && TRANSITION)
-            for (k = 0; k < N_COLUMNS; k++) memcpy(dx + ((long)sample * N_COLUMNS + k) * N_X, S + k * N_W, sizeof(double) * N_X);
+            for (k = 0; k < N_COLUMNS; k++)
+                for (i = 0; i < N_X; i++) dx[((long)sample * N_COLUMNS + k) * N_X + i] = ELEMENT(S, k, i);
         sample++;
     }
     return N;

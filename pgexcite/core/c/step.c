@@ -113,13 +113,14 @@ static int one_step(Stage *s, int rule, double h, int startup, double *x, double
     return 1;
 }
 
-/* Solves the algebraic unknowns again at fixed states. */
+/* Solves the algebraic unknowns again at fixed states, unless they are solved. */
 static int settle(Stage *s, double *x, double *z) {
     int i;
     aim(s, FROZEN);
     for (i = 0; i < N_X; i++) s->b[i] = s->mass[i] * x[i];
     memcpy(s->w[0], x, sizeof(double) * N_X); memcpy(s->w[0] + N_X, z, sizeof(double) * N_Z);
-    s->sloped = 0;
+    s->sloped = check_at(s, s->w[0]) < VERIFIED2;
+    if (s->sloped) return 1;
     if (!solve(s, check_at)) return 0;
     memcpy(x, s->w[0], sizeof(double) * N_X); memcpy(z, s->w[0] + N_X, sizeof(double) * N_Z);
     return 1;

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.export.horizon import horizon
+from pgexcite.core.export.parts import Numbers, Predictions
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.initialise import Initial
 from pgexcite.core.offset_free import LARGEST, OffsetFreeFilter
-from pgexcite.core.prediction import write_sensitivities
+from pgexcite.core.sensitivity import write_sensitivities
 from pgexcite.core.settings import Rule
 from pgexcite.core.step import RULES, Kernel
 
 Array = NDArray[np.float64]
-Numbers = NDArray[np.float64] | NDArray[np.int32]
 
 
 def predictions(
     kernel: Kernel, initial: Initial, horizons: Horizons, outputs: Sequence[str], rule: Rule
-) -> tuple[list[ca.Function], dict[str, object], dict[str, Numbers]]:
+) -> Predictions:
     """Functions, constants and arrays of linear predictions of these outputs around points of a model."""
     model, problem = kernel.model, horizons.problem
     commands = np.array([model.position("u", path) for path in problem.commands], dtype=np.int32)
@@ -41,9 +40,13 @@ def predictions(
         "n_kept": min(lengths * (known + 1) + 2 * known, 3 * problem.N_p),
     }
     arrays |= {"COMMANDS": commands, "U_START": initial.state.u, "P_START": initial.p}
-    sensitivities = write_sensitivities(kernel, commands, selected, columns)
-    constants["n_sense_hoisted"] = sensitivities[0].numel_out(0)
-    return [*kernel.stepping(), *sensitivities], kernel.constants() | constants | of_horizon, arrays
+    sensitivities = write_sensitivities(kernel, commands, selected)
+    return Predictions(
+        functions=[*kernel.stepping(), *sensitivities.functions()],
+        along=sensitivities.along(),
+        constants=kernel.constants() | sensitivities.constants() | constants | of_horizon,
+        arrays=arrays,
+    )
 
 
 def filtering(observer: OffsetFreeFilter) -> tuple[dict[str, object], dict[str, Numbers]]:

@@ -40,6 +40,19 @@ class Input:
         return Input(name, comment, len(elements), elements=elements)
 
 
+Numbers = NDArray[np.float64] | NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What the C of predictions is to know; see ``Parts``."""
+
+    functions: Sequence[ca.Function]
+    along: Sequence[ca.Function]
+    constants: Mapping[str, object]
+    arrays: Mapping[str, Numbers]
+
+
 @dataclass(frozen=True)
 class Parts:
     """The C of one solver, but for the quadratic program and the ladder.
@@ -51,6 +64,7 @@ class Parts:
         record: values of the inputs, one after the other, from a sample and the commands in force.
         condensed: the quadratic program.
         functions: generated functions of the model, no more than are called.
+        along: those among them that are called with several directions at a time.
         loops: files of ``core/c`` around them; see ``pgexcite.core.codegen.generate``.
         constants: what the templates are to know, by name; written as macros in capitals.
         arrays: constant arrays, by name.
@@ -66,9 +80,10 @@ class Parts:
     record: Callable[[Sample, Array], Sequence[Array | float]]
     condensed: Condensed
     functions: Sequence[ca.Function]
+    along: Sequence[ca.Function]
     loops: Sequence[str]
     constants: Mapping[str, object]
-    arrays: Mapping[str, NDArray[np.float64] | NDArray[np.int32]]
+    arrays: Mapping[str, Numbers]
     templates: Sequence[str]
     tolerance: float
     told: Sequence[str] = ()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,13 +10,12 @@ from pgexcite.core.controller import Sample
 from pgexcite.core.errors import ConfigError, Problem
 from pgexcite.core.export import shared
 from pgexcite.core.export.horizon import horizon
-from pgexcite.core.export.parts import Input, Parts
-from pgexcite.core.prediction import write_sensitivities
+from pgexcite.core.export.parts import Input, Numbers, Parts, Predictions
+from pgexcite.core.sensitivity import write_sensitivities
 from pgexcite.core.shooting import DECREASE, SHORTEST, Shooting
 from pgexcite.core.step import RULES
 
 Array = NDArray[np.float64]
-Numbers = NDArray[np.float64] | NDArray[np.int32]
 
 TOLERANCE = 1e-9
 """Measured 6e-13 pu; 2e-11 on an estimate."""
@@ -43,7 +41,7 @@ def nmpc_parts(shooting: Shooting, where: str) -> Parts:
         ConfigError: something in the configuration cannot be exported.
     """
     refuse(where, shooting)
-    model, (functions, constants, arrays) = shooting.kernel.model, planning(shooting)
+    model, predictions = shooting.kernel.model, planning(shooting)
     names = {"x": model.x_names, "z": model.z_names, "d": model.d_names, "u": model.u_names, "p": model.p_names}
     about = {
         "x": "the plant's differential states",
@@ -63,10 +61,11 @@ def nmpc_parts(shooting: Shooting, where: str) -> Parts:
         ),
         record=_record,
         condensed=shooting.condensed,
-        functions=functions,
+        functions=predictions.functions,
+        along=predictions.along,
         loops=LOOPS,
-        constants=constants,
-        arrays=arrays,
+        constants=predictions.constants,
+        arrays=predictions.arrays,
         templates=tuple(loop(file) for file in ("horizon.c", "shooting.c", "nmpc.c")),
         tolerance=tolerance(shooting),
     )
@@ -104,7 +103,7 @@ def refuse(where: str, shooting: Shooting) -> None:
         raise ConfigError(problems)
 
 
-def planning(shooting: Shooting) -> tuple[list[ca.Function], dict[str, object], dict[str, Numbers]]:
+def planning(shooting: Shooting) -> Predictions:
     """What ``horizon.c`` and ``shooting.c`` are to know: functions of the model, constants and arrays."""
     kernel, problem, options = shooting.kernel, shooting.problem, shooting.options
     model = kernel.model
@@ -137,10 +136,10 @@ def planning(shooting: Shooting) -> tuple[list[ca.Function], dict[str, object], 
         "COMMANDS": commands,
         "OTHERS": np.array(others, dtype=np.int32),
     }
-    sensitivities = write_sensitivities(kernel, commands, outputs, columns)
-    constants["n_sense_hoisted"] = sensitivities[0].numel_out(0)
-    return (
-        [*kernel.stepping(), kernel.functions.land, *sensitivities],
-        kernel.constants() | constants | horizon_constants,
-        arrays | horizon_arrays,
+    sensitivities = write_sensitivities(kernel, commands, outputs)
+    return Predictions(
+        functions=[*kernel.stepping(), kernel.functions.land, *sensitivities.functions()],
+        along=sensitivities.along(),
+        constants=kernel.constants() | sensitivities.constants() | constants | horizon_constants,
+        arrays=arrays | horizon_arrays,
     )

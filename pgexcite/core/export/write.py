@@ -131,6 +131,6 @@ def _model(session: Ladder, parts: Parts, measured: int) -> str:
     constants, arrays = shared.program(parts.condensed)
     of_ladder, start = shared.ladder(session, measured)
     defined = {"pgexcite_public": "static", **constants, **of_ladder, **parts.constants}
-    loops = generate(parts.functions, defined, parts.loops)
+    loops = generate(parts.functions, defined, parts.loops, parts.along)
     numbers = {**arrays, **start, **parts.arrays}
     return "\n".join([loops, *(array(name, values.ravel()) for name, values in numbers.items())]) + "\n"

@@ -173,7 +173,7 @@ class _Equivalent(Shooting):
         refuse(where, self)
         if not isinstance(self._observer, Writable):
             raise ConfigError([Problem(f"{where}.options.estimator", "this estimator offers no C")])
-        estimator, (functions, constants, arrays) = self._observer.written(), planning(self)
+        estimator, predictions = self._observer.written(), planning(self)
         seen = [*self._paths, self._field]
         told = "measured at this instant, pu of the unit's base; NaN where lost"
         return Parts(
@@ -191,10 +191,11 @@ class _Equivalent(Shooting):
                 u_last,
             ],
             condensed=self.condensed,
-            functions=(*functions, *estimator.functions),
+            functions=(*predictions.functions, *estimator.functions),
+            along=predictions.along,
             loops=LOOPS,
-            constants={**constants, **estimator.constants, **self._constants(len(seen))},
-            arrays={**arrays, **estimator.arrays, **self._arrays()},
+            constants={**predictions.constants, **estimator.constants, **self._constants(len(seen))},
+            arrays={**predictions.arrays, **estimator.arrays, **self._arrays()},
             templates=(*(loop(file) for file in ("horizon.c", "shooting.c")), estimator.text, _TEXT),
             tolerance=tolerance(self),
             told=estimator.told,

@@ -258,9 +258,7 @@ class _Linear:
             problems.append(Problem(f"{where}.backend", "the model is too large to be written out as C"))
         if problems:
             raise ConfigError(problems)
-        functions, constants, arrays = predictions(
-            self._kernel, self._initial, self._horizons, self._outputs, self._rule
-        )
+        local = predictions(self._kernel, self._initial, self._horizons, self._outputs, self._rule)
         of_filter, numbers = filtering(self.filter)
         every = {"once": 0, "scheduled": self.options.every, "every": 1}[self.options.relinearise]
         point = self._point_0
@@ -285,10 +283,11 @@ class _Linear:
             ),
             record=_recorded,
             condensed=self.condensed,
-            functions=functions,
+            functions=local.functions,
+            along=local.along,
             loops=("step.c", "rollout.c"),
-            constants=constants | of_filter | {"relinearise_every": every, "dt": self.problem.dt},
-            arrays=arrays | numbers | own,
+            constants={**local.constants, **of_filter, "relinearise_every": every, "dt": self.problem.dt},
+            arrays={**local.arrays, **numbers, **own},
             templates=(*(loop(file) for file in core), (Path(__file__).parent / "linear.c").read_text()),
             tolerance=_AGREEMENT,
             told=[name for name in self._diagnostics() if name != "age"],
