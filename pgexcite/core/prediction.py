@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,13 +127,12 @@ class Predictor:
         *,
         transitions: bool | None = None,
     ) -> None:
-        self._kernel, self._rule, self._n_moves = kernel, rule, n_moves
-        self._commands, self._outputs = np.array(commands, dtype=np.int32), np.array(outputs, dtype=np.int32)
+        self.kernel, self.rule, self._n_moves = kernel, rule, n_moves
+        self.commands, self._outputs = np.array(commands, dtype=np.int32), np.array(outputs, dtype=np.int32)
         n_x, n_u = kernel.x.size, len(commands)
         self.transitions = n_x < (n_moves - 1) * n_u if transitions is None else transitions
         columns = n_x + n_u if self.transitions else n_moves * n_u
-        self.sensitivities = write_sensitivities(kernel, self._commands, self._outputs)
-        self._library = self._compile(columns)
+        self.sensitivities = write_sensitivities(kernel, self.commands, self._outputs)
         rows = (kernel.w.size, n_x, n_u, self._outputs.size)
         # CasADi keeps matrices column by column, so a row of these arrays is a column of the sensitivity.
         self._S, self._S_b, self._S_c, self._S_y = (np.zeros((columns, n)) for n in rows)
@@ -140,21 +140,24 @@ class Predictor:
         self._w, self._b, self._y = np.zeros(kernel.w.size), np.zeros(n_x), np.zeros(self._outputs.size)
         self._sensing = [_Sensing(self) for _ in range(2)]
         self._commanded = _Commanded(self)
-        self._commands_at = _address(self._commands)
+        self._commands_at = _address(self.commands)
         self._call = _Call([np.zeros(n) for n in (n_x, kernel.z.size, kernel.d.size)], n_moves * n_u)
 
-    def _compile(self, columns: int) -> ctypes.CDLL | None:
-        if not self._kernel.compiled:
+    @cached_property
+    def _library(self) -> ctypes.CDLL | None:
+        if not self.kernel.compiled:
             return None
-        sizes = {"n_commands": self._commands.size, "n_columns": columns, "n_selected": self._outputs.size}
-        sizes |= {"transition": int(self.transitions)}
         written, loops = self.sensitivities, ["step.c", "rollout.c", "chain.c"]
-        constants, called = (
-            self._kernel.constants() | written.constants(),
-            [*self._kernel.stepping(), *written.functions()],
-        )
-        library = build(generate(called, constants | sizes, loops, written.along()))
+        called = [*self.kernel.stepping(), *written.functions()]
+        library = build(generate(called, self.constants(transitions=self.transitions), loops, written.along()))
         return None if library is None else load(library)
+
+    def constants(self, *, transitions: bool) -> dict[str, object]:
+        """What ``rollout.c`` needs to know, with derivatives in this way."""
+        n_x, n_u = self._b.size, self.commands.size
+        columns = n_x + n_u if transitions else self._n_moves * n_u
+        sizes: dict[str, object] = {"n_commands": n_u, "n_columns": columns, "n_selected": self._outputs.size}
+        return self.kernel.constants() | self.sensitivities.constants() | sizes | {"transition": int(transitions)}
 
     def roll(self, state: State, moves: Array, horizon: Horizon, *, derivatives: bool) -> Rollout | None:
         """Predict.
@@ -190,12 +193,12 @@ class Predictor:
         Returns:
             The transition, or ``None`` where the model cannot be stepped.
         """
-        kernel, (columns, n_x), n_y = self._kernel, (self._S.shape[0], self._b.size), self._outputs.size
-        segment = kernel.advance(state, p, self._rule, h, count)
+        kernel, (columns, n_x), n_y = self.kernel, (self._S.shape[0], self._b.size), self._outputs.size
+        segment = kernel.advance(state, p, self.rule, h, count)
         y, dy, dx = np.zeros((1, n_y)), np.zeros((1, columns, n_y)), np.zeros((1, columns, n_x))
         roll = self._roll if self._library is None else self._roll_compiled
         horizon = Horizon.plain(count, h, [0], state, p)
-        if segment.failed or not roll(state, np.ascontiguousarray(state.u[self._commands][None]), horizon, y, dy, dx):
+        if segment.failed or not roll(state, np.ascontiguousarray(state.u[self.commands][None]), horizon, y, dy, dx):
             return None
         y, C, D = self.outputs(segment.state, p)
         A, B = dx[0, :n_x].T.copy(), dx[0, n_x:].T.copy()
@@ -206,7 +209,7 @@ class Predictor:
     def outputs(self, state: State, p: Array) -> tuple[Array, Array, Array]:
         """Selected outputs at a point and their derivatives to the states and to the commands; needs ``transitions=True``."""
         n_x = self._b.size
-        self._kernel.begin(state, p)
+        self.kernel.begin(state, p)
         self._S[:], self._S_c[:] = 0.0, 0.0
         self._point_at(0, fresh=True)
         self._sense_settling()
@@ -219,7 +222,7 @@ class Predictor:
         call = self._call
         call.load(state, moves, horizon)
         done = self._library.pgexcite_rollout(
-            RULES.index(self._rule),
+            RULES.index(self.rule),
             len(horizon.counts),
             *call.pieces,
             self._commands_at,
@@ -234,7 +237,7 @@ class Predictor:
 
     def _condense(self, moves: NDArray[np.int32], dy: Array, dx: Array) -> Array:
         """Chained transitions, shape ``(N, n_y, n_x + n_moves * n_u)``."""
-        N, n_x, n_u = len(moves), self._b.size, self._commands.size
+        N, n_x, n_u = len(moves), self._b.size, self.commands.size
         columns = n_x + self._n_moves * n_u
         G = np.empty((N, columns, self._outputs.size))
         if self._library is not None:
@@ -252,7 +255,7 @@ class Predictor:
 
     def _roll(self, state: State, moves: Array, horizon: Horizon, y: Array, dy: Array, dx: Array) -> bool:
         """The same in CasADi's virtual machine."""
-        kernel, sense = self._kernel, dy.size > 0
+        kernel, sense = self.kernel, dy.size > 0
         kernel.begin(state.with_(u=horizon.u[0]), horizon.p[0])
         self._S[:], self._S_c[:] = 0.0, 0.0
         startup, sample, fresh, last = state.startup, 0, True, 0
@@ -284,8 +287,8 @@ class Predictor:
 
     def _enter(self, horizon: Horizon, move: Array, row: int, *, moved: bool) -> bool | None:
         """Put a piece's commands and parameters in force; whether they changed, ``None`` where nothing satisfies them."""
-        kernel, u = self._kernel, horizon.u[row].copy()
-        u[self._commands] = move
+        kernel, u = self.kernel, horizon.u[row].copy()
+        u[self.commands] = move
         changed = moved or not np.array_equal(u, kernel.u)
         if changed:
             if moved or self.sensitivities.commands_mass:
@@ -298,7 +301,7 @@ class Predictor:
 
     def _command(self, u: Array) -> None:
         """Put other commands in force, all else as it was: of what is hoisted, what depends on them alone is computed anew."""
-        kernel, written, commanded = self._kernel, self.sensitivities, self._commanded
+        kernel, written, commanded = self.kernel, self.sensitivities, self._commanded
         kernel.u[:] = u
         for c, q in kernel.hoisted():
             commanded.of(c)
@@ -312,7 +315,7 @@ class Predictor:
         """Directions of the sensitivities: the commands of a move, or each state and each command by itself."""
         if self.transitions and not fresh:
             return
-        n_x, n_u = self._b.size, self._commands.size
+        n_x, n_u = self._b.size, self.commands.size
         self._S_c[:] = 0.0
         if self.transitions:
             self._S[:] = 0.0
@@ -323,11 +326,11 @@ class Predictor:
 
     def _take(self, h: float, startup: int, *, sense: bool) -> int | None:
         """One step; the startup steps left, ``None`` where it cannot be taken."""
-        kernel = self._kernel
-        if not kernel.take(self._rule, h, startup, pivoting=False):
+        kernel = self.kernel
+        if not kernel.take(self.rule, h, startup, pivoting=False):
             return None
         if sense:
-            self._sense_step(euler=self._rule == "trapezoidal" and startup > 0)
+            self._sense_step(euler=self.rule == "trapezoidal" and startup > 0)
         if kernel.d.size and kernel.renew_discrete(h):
             if sense:
                 self._sense_settling()
@@ -337,14 +340,14 @@ class Predictor:
     def _aim(self, c: float) -> _Sensing:
         """Have the values at hand that are hoisted out of the sensitivities of stages with this coefficient."""
         sensing = self._sensing[c == FROZEN]
-        if sensing.of != (self._kernel.renewals, c):
+        if sensing.of != (self.kernel.renewals, c):
             sensing.c[0] = c
             sensing.prepare.trigger()
-            sensing.of = (self._kernel.renewals, c)
+            sensing.of = (self.kernel.renewals, c)
         return sensing
 
     def _sense_settling(self) -> None:
-        kernel, n_x = self._kernel, self._b.size
+        kernel, n_x = self.kernel, self._b.size
         kernel.aim(FROZEN)
         self._w[:n_x], self._w[n_x:] = kernel.x, kernel.z
         np.multiply(kernel.mass, kernel.x, out=self._b)
@@ -353,21 +356,21 @@ class Predictor:
         self._S[:] = self._S_new
 
     def _sense_step(self, *, euler: bool) -> None:
-        kernel, n_x = self._kernel, self._b.size
+        kernel, n_x = self.kernel, self._b.size
         c = float(kernel.c[0])
         sensing = self._aim(c)
         self._S_b[:] = self._S[:, :n_x] * kernel.mass
-        if not (self._rule == "backward_euler" or euler):
+        if not (self.rule == "backward_euler" or euler):
             sensing.slope.trigger()
             self._S_b += c * self._S_slope
-            if self._rule == "tr_bdf2":
+            if self.rule == "tr_bdf2":
                 sensing.middle.trigger()
                 self._S_b[:] = kernel.mass * (ALPHA * self._S_new[:, :n_x] - BETA * self._S[:, :n_x])
         sensing.stage.trigger()
         self._S[:] = self._S_new
 
     def _sense_outputs(self) -> None:
-        kernel, n_x = self._kernel, self._b.size
+        kernel, n_x = self.kernel, self._b.size
         self._w[:n_x], self._w[n_x:] = kernel.x, kernel.z
         self._aim(float(kernel.c[0])).outputs.trigger()
 
@@ -380,7 +383,7 @@ class _Sensing:
     """
 
     def __init__(self, predictor: Predictor) -> None:
-        k, s, written = predictor._kernel, predictor, predictor.sensitivities
+        k, s, written = predictor.kernel, predictor, predictor.sensitivities
         columns = s._S.shape[0]
         self.of, self.c, self.q = (-1, np.nan), np.zeros(1), np.zeros(written.prepare.numel_out(0))
         self.prepare = bind(written.prepare, [self.c, k.d, k.u, k.p], [self.q])
@@ -401,7 +404,7 @@ class _Commanded:
     """What depends on the commands of the values hoisted, by coefficient ``c``."""
 
     def __init__(self, predictor: Predictor) -> None:
-        k, written = predictor._kernel, predictor.sensitivities
+        k, written = predictor.kernel, predictor.sensitivities
         self._c, self.of_kernel, self.of_own = (np.zeros(n) for n in (1, written.of_kernel.size, written.of_own.size))
         self._compute = bind(written.commanded, [self._c, k.d, k.u, k.p], [self.of_kernel, self.of_own])
 

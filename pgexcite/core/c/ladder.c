@@ -10,13 +10,6 @@ static double ladder_seen[N_MEASURED];
 static int ladder_stale, ladder_has_seen;
 #endif
 
-static int all_finite(const double *a, int n) {
-    int i;
-    for (i = 0; i < n; i++)
-        if (a[i] - a[i] != 0) return 0;
-    return 1;
-}
-
 static void keep(const double *command, double *plan) {
     int i;
     for (i = 0; i < N_V; i++) plan[i] = command[i % N_COMMANDS];

@@ -18,6 +18,9 @@ typedef struct {
 static double plan[N_V];
 static int has_plan;
 
+/* By how much the last iteration changed a command at the most. */
+static double last_change;
+
 /* What was prepared for the next sample, and the sample it is prepared from. */
 static int prepared, has_origin;
 static double prepared_plan[N_V], prepared_p[AT_LEAST_1(N_P)];
@@ -153,6 +156,7 @@ static int feedback(const double *x, const double *u_last, const double *targets
             y[j * N_SELECTED + s] = value;
         }
     if (!direction_of(y, TO_MOVES(&ready), STRIDE, targets, prepared_plan, u_last, step, &slope)) return ${NAME}_QP_FAILED;
+    last_change = largest(step, N_V);
     take(&ready, targets, prepared_plan, step, u_last, y, found, cost);
     return ${NAME}_ITERATED;
 }
@@ -172,9 +176,12 @@ static int begin(const Point *at, const Horizon *over, const double *u_last, dou
     return 0;
 }
 
-/* Gauss-Newton with a line search on the true cost. A step of no more than `near` is the last, and taken on trust. */
-static int iterate(const Point *at, double t, const double *p, const double *u_last, const double *targets, int count,
-                   double near, double *found, double *cost, int *iterations) {
+/* Gauss-Newton with a line search on the true cost. A step of no more than `near`, and the last one where plans need not converge,
+   is taken on trust. */
+static int iterate(const Point *at, double t, const double *p, const double *u_last, const double *targets, int converge,
+                   double *found, double *cost, int *iterations) {
+    const int count = converge ? MAX_PLAN_ITERATIONS : JUMP_ITERATIONS;
+    const double near = converge ? PLAN_TOLERANCE : JUMP_TOLERANCE;
     static Prediction first, second;
     static Horizon over;
     static double trial[N_V], step[N_V];
@@ -188,9 +195,9 @@ static int iterate(const Point *at, double t, const double *p, const double *u_l
         ++*iterations;
         if (!direction_of(here->y, TO_MOVES(here), STRIDE, targets, found, u_last, step, &slope))
             return *iterations == 1 ? ${NAME}_QP_FAILED : status;
-        length = largest(step, N_V);
+        length = last_change = largest(step, N_V);
         if (length <= PLAN_TOLERANCE) return ${NAME}_CONVERGED;
-        if (length <= near) {
+        if (length <= near || (!converge && *iterations == count)) {
             take(here, targets, found, step, u_last, here->y, found, cost);
             return status;
         }
@@ -213,8 +220,7 @@ static int iterate(const Point *at, double t, const double *p, const double *u_l
 static int plan_from(const Point *at, double t, const double *p, const double *u_last, double *found, double *cost,
                      int *iterations) {
     static double targets[HORIZON * N_TRACKED];
-    int status, converge = CONVERGE || !has_plan, count = converge ? MAX_PLAN_ITERATIONS : JUMP_ITERATIONS;
-    double near = converge ? PLAN_TOLERANCE : JUMP_TOLERANCE;
+    int status;
     origin = *at;
     memcpy(origin_p, p, sizeof origin_p);
     origin_t = t;
@@ -229,11 +235,28 @@ static int plan_from(const Point *at, double t, const double *p, const double *u
         *iterations = 1;
         status = feedback(origin.x, u_last, targets, found, cost);
     } else {
-        status = iterate(&origin, origin_t, origin_p, u_last, targets, count, near, found, cost, iterations);
+        status = iterate(&origin, origin_t, origin_p, u_last, targets, CONVERGE || !has_plan, found, cost, iterations);
     }
     if (status <= ${NAME}_ITERATED) {
         memcpy(plan, found, sizeof plan);
         has_plan = 1;
     }
     return status;
+}
+
+/* Linearises around the plan the next sample will start from, at the state expected then. */
+static void prepare_from(const double *command) {
+    static Horizon over;
+    static double moved[N_V];
+    prepared = 0;
+    if (CONVERGE || !has_origin || !has_plan || !all_finite(command, N_COMMANDS)) return;
+    has_origin = 0; /* the point is moved on in place */
+    if (!advance(&origin, origin_t, origin_p, command)) return;
+    shift(plan, moved);
+    reach(moved, command, prepared_plan);
+    horizon_at(origin_t + ENDS[0], origin.u, origin_p, FIRST_COUNT, &over);
+    if (!predict(&origin, &over, prepared_plan, 1, &ready)) return;
+    expected = origin;
+    memcpy(prepared_p, origin_p, sizeof prepared_p);
+    prepared = 1;
 }

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.export.horizon import horizon
-from pgexcite.core.export.parts import Numbers, Predictions
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.initialise import Initial
 from pgexcite.core.offset_free import LARGEST, OffsetFreeFilter
 from pgexcite.core.sensitivity import write_sensitivities
 from pgexcite.core.settings import Rule
 from pgexcite.core.step import RULES, Kernel
+from pgexcite.core.written import Numbers, Predictions, horizon
 
 Array = NDArray[np.float64]
 

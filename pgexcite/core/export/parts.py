@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pgexcite.core.condensed import Condensed
 from pgexcite.core.controller import Sample
+from pgexcite.core.written import Numbers
 
 Array = NDArray[np.float64]
 
@@ -38,19 +39,6 @@ class Input:
     def of(name: str, comment: str, elements: Sequence[str]) -> Input:
         """A field with a number for each of these elements."""
         return Input(name, comment, len(elements), elements=elements)
-
-
-Numbers = NDArray[np.float64] | NDArray[np.int32]
-
-
-@dataclass(frozen=True)
-class Predictions:
-    """What the C of predictions is to know; see ``Parts``."""
-
-    functions: Sequence[ca.Function]
-    along: Sequence[ca.Function]
-    constants: Mapping[str, object]
-    arrays: Mapping[str, Numbers]
 
 
 @dataclass(frozen=True)

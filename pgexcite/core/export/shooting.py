@@ -9,11 +9,10 @@ from pgexcite.core.codegen import loop
 from pgexcite.core.controller import Sample
 from pgexcite.core.errors import ConfigError, Problem
 from pgexcite.core.export import shared
-from pgexcite.core.export.horizon import horizon
-from pgexcite.core.export.parts import Input, Numbers, Parts, Predictions
-from pgexcite.core.sensitivity import write_sensitivities
-from pgexcite.core.shooting import DECREASE, SHORTEST, Shooting
-from pgexcite.core.step import RULES
+from pgexcite.core.export.parts import Input, Parts
+from pgexcite.core.plans_in_c import LOOPS
+from pgexcite.core.shooting import Shooting
+from pgexcite.core.written import Predictions, planning
 
 Array = NDArray[np.float64]
 
@@ -21,9 +20,6 @@ TOLERANCE = 1e-9
 """Measured 6e-13 pu; 2e-11 on an estimate."""
 TOLERANCE_CONVERGED = 1e-5
 """With soft bounds, where rounding of the cost ends an iteration one program sooner or later: measured 1.5e-6 pu."""
-
-LOOPS = ("step.c", "advance.c", "rollout.c", "chain.c")
-"""What ``shooting.c`` goes below."""
 
 _ABOUT = """One predictive controller for one plant: plans on the plant's own step, from the plant's own state, as
    pgexcite.core.shooting makes them, and the checks of pgexcite.core.ladder."""
@@ -41,7 +37,7 @@ def nmpc_parts(shooting: Shooting, where: str) -> Parts:
         ConfigError: something in the configuration cannot be exported.
     """
     refuse(where, shooting)
-    model, predictions = shooting.kernel.model, planning(shooting)
+    model, predictions = shooting.kernel.model, exported_planning(shooting)
     names = {"x": model.x_names, "z": model.z_names, "d": model.d_names, "u": model.u_names, "p": model.p_names}
     about = {
         "x": "the plant's differential states",
@@ -103,43 +99,6 @@ def refuse(where: str, shooting: Shooting) -> None:
         raise ConfigError(problems)
 
 
-def planning(shooting: Shooting) -> Predictions:
-    """What ``horizon.c`` and ``shooting.c`` are to know: functions of the model, constants and arrays."""
-    kernel, problem, options = shooting.kernel, shooting.problem, shooting.options
-    model = kernel.model
-    commands = np.array([model.position("u", path) for path in problem.commands], dtype=np.int32)
-    outputs = np.array([model.position("y", path) for path in shooting.condensed.outputs()], dtype=np.int32)
-    converge = options.mode == "converged"
-    # What was prepared is corrected for the state.
-    transitions = shooting.predictor.transitions or not converge
-    columns = len(model.x_names) + commands.size if transitions else problem.N_c * commands.size
-    owned = {*problem.commands, *problem.fixed}
-    others = [k for k, path in enumerate(model.u_names) if path not in owned]
-    horizon_constants, horizon_arrays = horizon(shooting.horizons)
-    constants: dict[str, object] = {
-        "n_commands": commands.size,
-        "n_columns": columns,
-        "n_selected": outputs.size,
-        "transition": int(transitions),
-        "rule": RULES.index(shooting.rule),
-        "n_others": len(others),
-        "converge": int(converge),
-        "jump": options.jump,
-        "jump_tolerance": max(options.jump_tolerance, options.tolerance),
-        "plan_tolerance": options.tolerance,
-        "max_plan_iterations": options.max_iterations,
-        "jump_iterations": options.jump_iterations,
-        "shortest": SHORTEST,
-        "decrease": DECREASE,
-    }
-    arrays: dict[str, Numbers] = {
-        "COMMANDS": commands,
-        "OTHERS": np.array(others, dtype=np.int32),
-    }
-    sensitivities = write_sensitivities(kernel, commands, outputs)
-    return Predictions(
-        functions=[*kernel.stepping(), kernel.functions.land, *sensitivities.functions()],
-        along=sensitivities.along(),
-        constants=kernel.constants() | sensitivities.constants() | constants | horizon_constants,
-        arrays=arrays | horizon_arrays,
-    )
+def exported_planning(shooting: Shooting) -> Predictions:
+    """What its ``horizon.c`` and ``shooting.c`` are to know."""
+    return planning(shooting.predictor, shooting.condensed, shooting.horizons, shooting.options, exported=True)

@@ -16,6 +16,8 @@ from pgexcite.core.export import shared, text
 from pgexcite.core.export.parts import Exportable, Parts
 from pgexcite.core.export.recorder import Recorder
 from pgexcite.core.ladder import Ladder
+from pgexcite.core.shooting import Shooting
+from pgexcite.core.written import program
 
 _SHARED = ("dense.c", "qp.c", "condensed.c", "ladder.c")
 """What goes above the parts of every solver."""
@@ -62,6 +64,9 @@ def export_c(scenario: Scenario, directory: Path, controller: str = "") -> Expor
     prefix = _prefix(name, parts)
     files = _files(prefix, scenario, session, parts, len(measured))
     _ensure_ours(directory, [*files, "replay.txt"])
+    if isinstance(session.solver, Shooting):
+        # What is replayed was planned by other code than what replays it.
+        session.solver.plan_in_python()
     recorder = Recorder(session, parts)
     simulation.run()
     files["replay.txt"] = "".join(f"{line}\n" for line in recorder.lines)
@@ -128,7 +133,7 @@ def _files(name: str, scenario: Scenario, session: Ladder, parts: Parts, measure
 
 def _model(session: Ladder, parts: Parts, measured: int) -> str:
     """The functions of the model, the loops around them, and all numbers."""
-    constants, arrays = shared.program(parts.condensed)
+    constants, arrays = program(parts.condensed)
     of_ladder, start = shared.ladder(session, measured)
     defined = {"pgexcite_public": "static", **constants, **of_ladder, **parts.constants}
     loops = generate(parts.functions, defined, parts.loops, parts.along)

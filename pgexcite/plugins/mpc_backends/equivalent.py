@@ -18,13 +18,15 @@ from pgexcite.core.equivalent import TERMINALS, Equivalent
 from pgexcite.core.errors import ConfigError, Problem, RegistryError
 from pgexcite.core.estimation import Estimate, Estimator, Observer, Writable
 from pgexcite.core.export import Input, Parts
-from pgexcite.core.export.shooting import DELAYED, LOOPS, planning, refuse, tolerance
+from pgexcite.core.export.shooting import DELAYED, exported_planning, refuse, tolerance
+from pgexcite.core.iteration import ShootingOptions
 from pgexcite.core.memory import as_arrays, those_under, under
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solution, Solver
+from pgexcite.core.plans_in_c import LOOPS
 from pgexcite.core.registry import find
-from pgexcite.core.shooting import Shooting, ShootingOptions
+from pgexcite.core.shooting import Shooting
 
 Array = NDArray[np.float64]
 
@@ -173,7 +175,7 @@ class _Equivalent(Shooting):
         refuse(where, self)
         if not isinstance(self._observer, Writable):
             raise ConfigError([Problem(f"{where}.options.estimator", "this estimator offers no C")])
-        estimator, predictions = self._observer.written(), planning(self)
+        estimator, predictions = self._observer.written(), exported_planning(self)
         seen = [*self._paths, self._field]
         told = "measured at this instant, pu of the unit's base; NaN where lost"
         return Parts(

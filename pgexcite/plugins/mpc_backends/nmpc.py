@@ -16,11 +16,12 @@ from pgexcite.core.controller import Plant, Sample, Surroundings
 from pgexcite.core.declare import par
 from pgexcite.core.errors import ConfigError, Problem
 from pgexcite.core.export import Parts, nmpc_parts
+from pgexcite.core.iteration import ShootingOptions
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem as ControlProblem
 from pgexcite.core.mpc import Solver
 from pgexcite.core.registry import nearest
-from pgexcite.core.shooting import Shooting, ShootingOptions
+from pgexcite.core.shooting import Shooting
 from pgexcite.core.step import Kernel
 
 
@@ -28,8 +29,8 @@ class NMPC(BaseModel):
     """Perfect-model NMPC: the prediction is the plant's own step, from the plant's own state.
 
     With ``mode = "rti"`` a sample solves one quadratic program, prepared before the sample around the plan it expects; where the
-    state or the network is not what was expected (a fault), ``jump_iterations`` are made instead. ``"converged"`` iterates every
-    plan to ``tolerance``. Taps and limiters inside the horizon make minima that no descent leaves: ``candidates`` constant plans
+    state or the network is not what was expected (a fault), ``jump_iterations`` are made instead, with a line search but for the
+    last, whose step is taken on trust as that of a prepared program is. ``"converged"`` iterates every plan to ``tolerance``. Taps and limiters inside the horizon make minima that no descent leaves: ``candidates`` constant plans
     are tried first, and the best is where the iteration starts.
 
     ``mismatch`` makes the model wrong where that is wanted: it predicts with other values of the parameters named, by the same
