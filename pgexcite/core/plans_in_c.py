@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 LOOPS = ("step.c", "advance.c", "rollout.c", "chain.c")
 """What ``shooting.c`` goes below."""
-_TEXTS = ("dense.c", "qp.c", "condensed.c", "horizon.c", "shooting.c", "plans.c")
+_TEXTS = ("dense.c", "qp.c", "condensed.c", "horizon.c", "shooting.c", "prepare.c", "plans.c")
 _STATUS = (Status.CONVERGED, Status.ITERATED, Status.PREDICTION_FAILED, Status.STATE_UNKNOWN, Status.QP_FAILED)
 _NAME = "PLANS"
 

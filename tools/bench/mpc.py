@@ -155,7 +155,7 @@ def real_time_iteration(N: int, t_end: float, asked: Sequence[Any], passes: int,
     feedback, whole = Times(), Times()
 
     def once() -> None:
-        solver.recall({"multipliers": np.zeros_like(solver.condensed.solver.memory())})
+        solver.recall({})
         for k, (sample, u_last) in enumerate(asked):
             solution = feedback.measure(lambda s=sample, u=u_last: solver.solve(s, u))
             # What was sent is what the loop that made the sequence sent.
@@ -167,12 +167,13 @@ def real_time_iteration(N: int, t_end: float, asked: Sequence[Any], passes: int,
     return Contestant({f"{name}, feedback": feedback, f"{name}, with preparation": whole}, once, passes)
 
 
-def exported(N: int, t_end: float, folder: Path, passes: int, step: float = 0.0) -> Contestant:
-    """The exported C on its own replay."""
-    directory = export_c(scenario(N, t_end, options=f"{{step={step}}}"), folder / f"c{N}-{step}").directory
-    cc = codegen.compiler()
+def exported(N: int, t_end: float, folder: Path, passes: int, step: float = 0.0, programs: int = 2) -> Contestant:
+    """The exported C on its own replay, compiled for this processor; so many programs after a jump."""
+    options = f"{{step={step}, jump_iterations={programs}}}"
+    directory = export_c(scenario(N, t_end, options=options), folder / f"c{N}-{step}-{programs}").directory
+    cc, (native, _) = codegen.compiler(), codegen.processor()
     assert cc is not None
-    command = [cc, "-std=c99", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "mpc.c", "-o", "mpc.so", "-lm"]
+    command = [cc, "-std=c99", "-O2", *native, "-ffp-contract=off", "-fPIC", "-shared", "mpc.c", "-o", "mpc.so", "-lm"]
     subprocess.run(command, cwd=directory, check=True)
     library = ctypes.CDLL(str(directory / "mpc.so"))
     sizes = [int(n) for n in re.findall(r"MPC_N_[XZDUP] = (\d+)", (directory / "mpc.h").read_text())]
@@ -201,7 +202,7 @@ def exported(N: int, t_end: float, folder: Path, passes: int, step: float = 0.0)
             feedback.measure(lambda i=item: library.mpc_step(ctypes.byref(i), output))
             whole.together(feedback, lambda: library.mpc_prepare(output))
 
-    name = named("exported C", step)
+    name = named("exported C" if programs > 1 else "exported C, one program after a jump", step)
     return Contestant({f"{name}, feedback": feedback, f"{name}, with preparation": whole}, once, passes)
 
 
@@ -347,6 +348,7 @@ def main() -> None:
                 all_of_them += [
                     real_time_iteration(N, told.t_end, asked, told.passes, step),
                     exported(N, told.t_end, folder, told.passes, step),
+                    exported(N, told.t_end, folder, told.passes, step, programs=1),
                     slsqp(N, told.t_end, asked, told.slow_passes, step),
                 ]
             if there:

@@ -96,7 +96,7 @@ class Planner:
         free = Simulation(scenario.system, settings, scenario.changes, {})
         free.run()
         self.sample = Sample(UNTIL, {}, True, free.state, free.p)
-        self.u_last = free.state.u[self.solver._commands]
+        self.u_last = free.state.u[self.solver.predictor.commands]
         self.hold = np.tile(self.u_last, (case.N_c, 1))
         self.states, self.unknowns = len(free.model.x_names), len(free.model.z_names)
 
@@ -121,7 +121,7 @@ class Planner:
 
     def plan(self) -> Any:
         """A plan that has converged, from holding the commands."""
-        self.solver.recall({"multipliers": np.zeros_like(self.solver.condensed.solver.memory())})
+        self.solver.recall({})
         return self.solver.solve(self.sample, self.u_last)
 
 

@@ -1,4 +1,4 @@
-/* Nonlinear MPC from the plant's own state: the backend "nmpc". Goes below shooting.c. */
+/* Nonlinear MPC from the plant's own state: the backend "nmpc". Goes below prepare.c. */
 
 static int is_known(const ${name}_input *in) {
     return all_finite(&in->t, 1) && all_finite(in->x, N_X) && all_finite(in->z, N_Z) && all_finite(in->d, N_D) &&

@@ -1,4 +1,4 @@
-/* Plans for Python: what pgexcite.core.plans_in_c calls. Goes below shooting.c. */
+/* Plans for Python: what pgexcite.core.plans_in_c calls. Goes below prepare.c. */
 
 /* A plan from the state that these arrays hold: its status; what was found, its cost and largest change in the last iteration. */
 PGEXCITE_PUBLIC int pgexcite_plan(double t, int startup, const double *x, const double *z, const double *d, const double *u,

@@ -62,7 +62,7 @@ def nmpc_parts(shooting: Shooting, where: str) -> Parts:
         loops=LOOPS,
         constants=predictions.constants,
         arrays=predictions.arrays,
-        templates=tuple(loop(file) for file in ("horizon.c", "shooting.c", "nmpc.c")),
+        templates=tuple(loop(file) for file in ("horizon.c", "shooting.c", "prepare.c", "nmpc.c")),
         tolerance=tolerance(shooting),
     )
 
