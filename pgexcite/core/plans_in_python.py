@@ -60,7 +60,7 @@ class PlansInPython:
     def plan(self, state: State, t: float, p: Array, u_last: Array) -> Solution:
         """The plan from this state on."""
         if self.problem.delayed:
-            later = self._advance(state, t, u_last, p)
+            later = a_sample_later(self.predictor, self.horizons, state, t, u_last, p)
             if later is None:
                 return failed(self.condensed, Status.PREDICTION_FAILED, u_last)
             state, p = later
@@ -82,7 +82,7 @@ class PlansInPython:
         if self.options.mode != "rti" or self._from is None or self._plan is None:
             return
         state, t, p = self._from
-        later = self._advance(state, t, u, p)
+        later = a_sample_later(self.predictor, self.horizons, state, t, u, p)
         if later is None:
             return
         expected, p = later
@@ -118,31 +118,6 @@ class PlansInPython:
             solver.recall(np.zeros_like(solver.memory()) if multipliers is None else multipliers)
 
     # Planning.
-
-    def _advance(self, state: State, t: float, u: Array, p: Array) -> tuple[State, Array] | None:
-        """State and parameters one sample later under these commands, with all that is known to happen by then."""
-        horizon = self.horizons.first(t, state.u, p)
-        row = -1
-        for count, h, k in zip(horizon.counts, horizon.lengths, horizon.rows, strict=True):
-            if k != row:
-                wanted = horizon.u[k].copy()
-                wanted[self.predictor.commands] = u
-                if row >= 0 or not np.array_equal(wanted, state.u):
-                    settled = self.kernel.settle(state.with_(u=wanted), horizon.p[k])
-                    if settled is None:
-                        return None
-                    state = settled
-                row = int(k)
-            segment = self.kernel.advance(state, horizon.p[k], self.predictor.rule, float(h), int(count))
-            if segment.failed:
-                return None
-            state = segment.state
-        wanted, after = self.horizons.between(t, t + self.problem.dt, horizon.u[0], p)
-        wanted[self.predictor.commands] = u
-        if np.array_equal(after, horizon.p[row]) and np.array_equal(wanted, state.u):
-            return state, after
-        settled = self.kernel.settle(state.with_(u=wanted), after)
-        return None if settled is None else (settled, after)
 
     def _expected(self, state: State, p: Array) -> _Prepared | None:
         """The linearisation prepared for this sample, unless state, network or the commands of others are not as expected."""
@@ -271,6 +246,35 @@ class PlansInPython:
                     return trial, rolled, trial_cost
             scale /= 2
         return None
+
+
+def a_sample_later(
+    predictor: Predictor, horizons: Horizons, state: State, t: float, u: Array, p: Array
+) -> tuple[State, Array] | None:
+    """State and parameters one sample later under these commands, with all that is known to happen by then."""
+    kernel = predictor.kernel
+    horizon = horizons.first(t, state.u, p)
+    row = -1
+    for count, h, k in zip(horizon.counts, horizon.lengths, horizon.rows, strict=True):
+        if k != row:
+            wanted = horizon.u[k].copy()
+            wanted[predictor.commands] = u
+            if row >= 0 or not np.array_equal(wanted, state.u):
+                settled = kernel.settle(state.with_(u=wanted), horizon.p[k])
+                if settled is None:
+                    return None
+                state = settled
+            row = int(k)
+        segment = kernel.advance(state, horizon.p[k], predictor.rule, float(h), int(count))
+        if segment.failed:
+            return None
+        state = segment.state
+    wanted, after = horizons.between(t, t + horizons.problem.dt, horizon.u[0], p)
+    wanted[predictor.commands] = u
+    if np.array_equal(after, horizon.p[row]) and np.array_equal(wanted, state.u):
+        return state, after
+    settled = kernel.settle(state.with_(u=wanted), after)
+    return None if settled is None else (settled, after)
 
 
 def failed(condensed: Condensed, status: Status, u_last: Array) -> Solution:

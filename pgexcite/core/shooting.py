@@ -19,7 +19,7 @@ from pgexcite.core.iteration import ShootingOptions
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Problem, Solution, Status
 from pgexcite.core.plans_in_c import plans_in_c
-from pgexcite.core.plans_in_python import PlansInPython, failed
+from pgexcite.core.plans_in_python import PlansInPython, a_sample_later, failed
 from pgexcite.core.prediction import Predictor
 from pgexcite.core.program import QPSolver
 from pgexcite.core.settings import Rule
@@ -122,6 +122,10 @@ class Shooting(ABC):
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
         self.plans.recall(memory)
+
+    def later(self, state: State, t: float, u: Array, p: Array) -> tuple[State, Array] | None:
+        """State and parameters one sample later under these commands; ``None`` where the model cannot be stepped."""
+        return a_sample_later(self.predictor, self.horizons, state, t, u, p)
 
     def plan_in_python(self) -> None:
         """Have plans made in Python, as a reference for those of C."""

@@ -164,7 +164,7 @@ class _Equivalent(Shooting):
         """A state carried on under these commands of the plant, a sample each."""
         for command in commands:
             # Nothing in an equivalent is known to change at any time: the clock does not matter.
-            later = None if state is None else self._advance(state, state.t, command + self._offset, self.p)
+            later = None if state is None else self.later(state, state.t, command + self._offset, self.p)
             state = later[0] if later else None
         return state
 

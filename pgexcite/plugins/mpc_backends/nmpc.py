@@ -30,8 +30,9 @@ class NMPC(BaseModel):
 
     With ``mode = "rti"`` a sample solves one quadratic program, prepared before the sample around the plan it expects; where the
     state or the network is not what was expected (a fault), ``jump_iterations`` are made instead, with a line search but for the
-    last, whose step is taken on trust as that of a prepared program is. ``"converged"`` iterates every plan to ``tolerance``. Taps and limiters inside the horizon make minima that no descent leaves: ``candidates`` constant plans
-    are tried first, and the best is where the iteration starts.
+    last, whose step is taken on trust as that of a prepared program is. ``"converged"`` iterates every plan to ``tolerance``. Taps
+    and limiters inside the horizon make minima that no descent leaves: ``candidates`` constant plans are tried first, and the best
+    is where the iteration starts.
 
     ``mismatch`` makes the model wrong where that is wanted: it predicts with other values of the parameters named, by the same
     equations. The state it starts from remains the plant's own.
