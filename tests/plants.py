@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pgexcite.core.component import Component
-from pgexcite.core.mpc import Problem
+from pgexcite.core.mpc import ControlProblem
 from pgexcite.core.network import Bus, Line, Transformer
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.system import Device, Schedule, System
@@ -91,7 +91,7 @@ def push(simulation: Simulation, state: str, by: float) -> None:
     simulation.state = settled
 
 
-def voltage_problem(command: str, **changes: object) -> Problem:
+def voltage_problem(command: str, **changes: object) -> ControlProblem:
     """The paper's problem for unit G2 with three moves, in terms of one command; ``changes`` are its fields."""
     values: dict[str, object] = {
         "dt": 0.05,
@@ -108,4 +108,4 @@ def voltage_problem(command: str, **changes: object) -> Problem:
         "du_max": np.array([np.inf]),
         "V_ref": np.array([1.0]),
     }
-    return Problem(**(values | changes))
+    return ControlProblem(**(values | changes))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.mpc import Problem
+from pgexcite.core.mpc import ControlProblem
 from pgexcite.core.program import Program, QPSolver, Rows
 from pgexcite.core.qp import WarmSolver
 
@@ -69,7 +69,7 @@ class Condensed:
         solver: of programs with ``variables`` variables and ``rows`` rows; ``WarmSolver`` where left out.
     """
 
-    def __init__(self, problem: Problem, solver: QPSolver | None = None) -> None:
+    def __init__(self, problem: ControlProblem, solver: QPSolver | None = None) -> None:
         self.problem = problem
         n_u, self._n_soft = len(problem.commands), len(problem.soft)
         self.n = problem.N_c * n_u

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pgexcite.core.events import Change
 from pgexcite.core.model import Model
-from pgexcite.core.mpc import Problem
+from pgexcite.core.mpc import ControlProblem
 from pgexcite.core.prediction import Horizon
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class Horizons:
     """
 
     model: Model
-    problem: Problem
+    problem: ControlProblem
     h: float
     grid: float
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pgexcite.core.controller import Action, Sample
 from pgexcite.core.memory import as_arrays, those_under, under
-from pgexcite.core.mpc import Problem, Solution, Solver, Status
+from pgexcite.core.mpc import ControlProblem, Solution, Solver, Status
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ class Ladder:
     """
 
     def __init__(
-        self, problem: Problem, solver: Solver, actuator: Actuator, options: LadderOptions, u_0: Array
+        self, problem: ControlProblem, solver: Solver, actuator: Actuator, options: LadderOptions, u_0: Array
     ) -> None:
         self.problem, self.solver, self.actuator, self.options = problem, solver, actuator, options
         self.u_0 = self._home = u_0

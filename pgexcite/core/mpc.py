@@ -55,7 +55,7 @@ class SoftBound:
 
 
 @dataclass(frozen=True)
-class Problem:
+class ControlProblem:
     """An excitation control problem over a receding horizon.
 
     Attributes:
@@ -218,6 +218,6 @@ class Backend(Protocol):
         """Whether it needs the plant's state and model."""
         ...
 
-    def start(self, problem: Problem, surroundings: Surroundings, plant: Plant | None) -> Solver:
+    def start(self, problem: ControlProblem, surroundings: Surroundings, plant: Plant | None) -> Solver:
         """Begin a run."""
         ...

@@ -17,7 +17,7 @@ from pgexcite.core.controller import Sample
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.iteration import ShootingOptions
 from pgexcite.core.model import State
-from pgexcite.core.mpc import Problem, Solution, Status
+from pgexcite.core.mpc import ControlProblem, Solution, Status
 from pgexcite.core.plans_in_c import plans_in_c
 from pgexcite.core.plans_in_python import PlansInPython, a_sample_later, failed
 from pgexcite.core.prediction import Predictor
@@ -75,7 +75,7 @@ class Shooting(ABC):
     def __init__(
         self,
         kernel: Kernel,
-        problem: Problem,
+        problem: ControlProblem,
         options: ShootingOptions,
         *,
         rule: Rule,

@@ -7,7 +7,7 @@ import pytest
 
 from pgexcite.core.controller import Sample
 from pgexcite.core.ladder import Actuator, Ladder, LadderOptions
-from pgexcite.core.mpc import Problem, Solution, Status
+from pgexcite.core.mpc import ControlProblem, Solution, Status
 
 SIGNALS = ("unit.G.v_t", "unit.G.omega", "unit.G.e_fd")
 
@@ -31,7 +31,7 @@ class Planner:
 
 def ladder(*, perfect=False):
     one = np.ones(1)
-    problem = Problem(
+    problem = ControlProblem(
         dt=0.05, N_p=3, blocks=(1,), commands=("unit.G.transfer.e_fd_cmd",), voltages=SIGNALS[:1], speeds=SIGNALS[1:2],
         Q=one, P=one, R=one, u_min=-3 * one, u_max=3 * one, du_max=np.inf * one, V_ref=one,
     )  # fmt: skip

@@ -15,8 +15,7 @@ from pgexcite.core.errors import ConfigError, Problem, RegistryError
 from pgexcite.core.events import Change
 from pgexcite.core.ladder import Actuator, Ladder, LadderOptions
 from pgexcite.core.measurement import Measurement
-from pgexcite.core.mpc import Backend, SoftBound
-from pgexcite.core.mpc import Problem as ControlProblem
+from pgexcite.core.mpc import Backend, ControlProblem, SoftBound
 from pgexcite.core.registry import find
 from pgexcite.plugins.controllers.per_signal import NotNegative, Number, Positive, each
 

@@ -22,8 +22,7 @@ from pgexcite.core.export.shooting import DELAYED, exported_planning, refuse, to
 from pgexcite.core.iteration import ShootingOptions
 from pgexcite.core.memory import as_arrays, those_under, under
 from pgexcite.core.model import State
-from pgexcite.core.mpc import Problem as ControlProblem
-from pgexcite.core.mpc import Solution, Solver
+from pgexcite.core.mpc import ControlProblem, Solution, Solver
 from pgexcite.core.plans_in_c import LOOPS
 from pgexcite.core.registry import find
 from pgexcite.core.shooting import Shooting

@@ -29,8 +29,7 @@ from pgexcite.core.horizons import Horizons
 from pgexcite.core.ladder import PLAUSIBLE
 from pgexcite.core.local import LocalModel
 from pgexcite.core.memory import as_arrays, those_under, under
-from pgexcite.core.mpc import Problem as ControlProblem
-from pgexcite.core.mpc import Solution, Solver, Status
+from pgexcite.core.mpc import ControlProblem, Solution, Solver, Status
 from pgexcite.core.nameplate import own_model
 from pgexcite.core.offset_free import Disturbances, Noise, OffsetFreeFilter
 from pgexcite.core.prediction import Horizon, Predictor, Transition

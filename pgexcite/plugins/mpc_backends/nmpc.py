@@ -18,8 +18,7 @@ from pgexcite.core.errors import ConfigError, Problem
 from pgexcite.core.export import Parts, nmpc_parts
 from pgexcite.core.iteration import ShootingOptions
 from pgexcite.core.model import State
-from pgexcite.core.mpc import Problem as ControlProblem
-from pgexcite.core.mpc import Solver
+from pgexcite.core.mpc import ControlProblem, Solver
 from pgexcite.core.registry import nearest
 from pgexcite.core.shooting import Shooting
 from pgexcite.core.step import Kernel
