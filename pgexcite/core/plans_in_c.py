@@ -14,7 +14,7 @@ from string import Template
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.codegen import array, build, define, generate, load, loop
+from pgexcite.core.codegen import array, define, generate, load, loop
 from pgexcite.core.condensed import Condensed
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.iteration import ShootingOptions
@@ -39,21 +39,21 @@ def plans_in_c(
     same = not condensed.rows and not options.candidates and predictor.rule != "trapezoidal"
     if not (predictor.kernel.compiled and same and (condensed.problem.R > 0).all()):
         return None
-    return PlansInC(predictor, condensed, horizons, options)
+    library = _compiled(predictor, condensed, horizons, options)
+    return None if library is None else PlansInC(load(library), predictor, condensed)
 
 
 class PlansInC:
     """A library of its own for one controller; it remembers the plan and what was prepared.
 
     Args:
-        predictor, condensed, horizons, options: of the plans, see ``pgexcite.core.shooting.Shooting``.
+        library: a copy of one's own.
+        predictor, condensed: of the plans, see ``pgexcite.core.shooting.Shooting``.
     """
 
-    def __init__(
-        self, predictor: Predictor, condensed: Condensed, horizons: Horizons, options: ShootingOptions
-    ) -> None:
+    def __init__(self, library: ctypes.CDLL, predictor: Predictor, condensed: Condensed) -> None:
         problem, kernel = condensed.problem, predictor.kernel
-        self._library = load(_compiled(predictor, condensed, horizons, options))
+        self._library = library
         n_x = kernel.x.size if predictor.transitions else 0
         self._moves, n_y = (problem.N_c, len(problem.commands)), len(condensed.outputs())
         self._shape_G = (problem.N_p, n_x + condensed.n, n_y)
@@ -119,8 +119,8 @@ class PlansInC:
         self._library.pgexcite_remember(1, there, *(_address(a) for a in self._kept))
 
 
-def _compiled(predictor: Predictor, condensed: Condensed, horizons: Horizons, options: ShootingOptions) -> Path:
-    """The library; it is there, for the kernel's is."""
+def _compiled(predictor: Predictor, condensed: Condensed, horizons: Horizons, options: ShootingOptions) -> Path | None:
+    """The library, where it is to be waited for."""
     of_plans, (of_program, numbers) = (
         planning(predictor, condensed, horizons, options, exported=False),
         program(condensed),
@@ -133,9 +133,7 @@ def _compiled(predictor: Predictor, condensed: Condensed, horizons: Horizons, op
         *(array(name, values.ravel()) for name, values in {**numbers, **of_plans.arrays}.items()),
         *(Template(loop(name)).substitute(words) for name in _TEXTS),
     ]
-    library = build("\n".join(source))
-    assert library is not None
-    return library
+    return predictor.kernel.library("\n".join(source), of_plans.functions)
 
 
 def _address(values: NDArray[np.float64]) -> ctypes.c_void_p:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.codegen import build, generate, load
+from pgexcite.core.codegen import generate, load
 from pgexcite.core.model import State
 from pgexcite.core.sensitivity import Along, write_sensitivities
 from pgexcite.core.settings import Rule
@@ -149,7 +149,8 @@ class Predictor:
             return None
         written, loops = self.sensitivities, ["step.c", "rollout.c", "chain.c"]
         called = [*self.kernel.stepping(), *written.functions()]
-        library = build(generate(called, self.constants(transitions=self.transitions), loops, written.along()))
+        source = generate(called, self.constants(transitions=self.transitions), loops, written.along())
+        library = self.kernel.library(source, called)
         return None if library is None else load(library)
 
     def constants(self, *, transitions: bool) -> dict[str, object]:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -169,7 +169,7 @@ class Kernel:
             return None
         return None if library is None else CompiledLoop(library)
 
-    def library(self, source: str, called: list[ca.Function]) -> Path | None:
+    def library(self, source: str, called: Sequence[ca.Function]) -> Path | None:
         """The library of a source with these functions; ``None`` where ``compile = "auto"`` does not wait for it.
 
         Raises:

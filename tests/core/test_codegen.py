@@ -16,6 +16,7 @@ from pgexcite.core.initialise import initialise
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.step import Kernel
+from pgexcite.plugins.controllers.mpc import MPC
 from pgexcite.plugins.machines.salient_pole import SalientPole
 
 FAULT = Fault(type="fault", t=0.05, bus="HV", R=0.02, duration=0.1).changes()
@@ -66,6 +67,19 @@ def test_auto_leaves_a_large_model_to_the_virtual_machine_and_wait_does_not(monk
     assert libraries(cache) == []
     assert simulation("wait").kernel.compiled
     assert simulation("auto").kernel.compiled  # it is there now
+
+
+def test_auto_waits_for_no_large_prediction_either(monkeypatch, cache):
+    """The plant's library is there from another run; that is no reason to wait for the plans'."""
+    controlled = {"mpc": MPC(unit="G2")}
+    simulation("wait")
+    monkeypatch.setattr("pgexcite.core.step.COMPILED_BY_DEFAULT", 10)
+    run = Simulation(kobbelv(), Settings(0.2, 0.005, compile="auto"), FAULT, controlled)
+    assert run.kernel.compiled
+    run.run()
+    assert len(libraries(cache)) == 1
+    Simulation(kobbelv(), Settings(0.2, 0.005, compile="wait"), FAULT, controlled).run()
+    assert len(libraries(cache)) > 1
 
 
 def test_without_a_compiler_always_is_an_error_that_says_what_to_do(monkeypatch):
