@@ -8,9 +8,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pgexcite.core.bound import bind
 from pgexcite.core.codegen import CompilationError, build, compiler, load, loop, write_functions
 from pgexcite.core.settings import Compile
-from pgexcite.core.step import bind
 
 Array = NDArray[np.float64]
 

@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pgexcite.core.bound import Bound, bind
 from pgexcite.core.codegen import generate, load
 from pgexcite.core.model import State
 from pgexcite.core.sensitivity import Along, write_sensitivities
 from pgexcite.core.settings import Rule
 from pgexcite.core.stage import ALPHA, BETA, FROZEN
-from pgexcite.core.step import RULES, STARTUP_STEPS, Bound, Kernel, bind
+from pgexcite.core.step import RULES, STARTUP_STEPS, Kernel
 
 Array = NDArray[np.float64]
 

@@ -5,16 +5,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from pgexcite.core.bound import bind
 from pgexcite.core.codegen import CompilationError, CompiledLoop, build, compiler, generate
 from pgexcite.core.model import Model, State
 from pgexcite.core.pivoting import solved
@@ -65,24 +65,6 @@ class Segment:
     state: State
     failed: bool = False
     rescued: int = 0
-
-
-@dataclass
-class Bound:
-    """A compiled function bound to fixed arrays: a call costs about a microsecond instead of a hundred."""
-
-    trigger: Callable[[], None]
-    keep: list[Any] = field(default_factory=list)
-
-
-def bind(function: Any, arguments: list[Array], results: list[Array]) -> Bound:
-    """Bind a CasADi function to contiguous float64 arrays, which it reads and writes in place."""
-    buffer, trigger = function.buffer()
-    for k, array in enumerate(arguments):
-        buffer.set_arg(k, array.data)
-    for k, array in enumerate(results):
-        buffer.set_res(k, array.data)
-    return Bound(trigger, [function, buffer, *arguments, *results])
 
 
 class Kernel:
