@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pgexcite.core.events import Change
 from pgexcite.core.model import Model
 from pgexcite.core.mpc import ControlProblem
-from pgexcite.core.prediction import Horizon
+from pgexcite.core.rollout import Horizon
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.model import State
-from pgexcite.core.prediction import Horizon, Predictor, Transition
+from pgexcite.core.prediction import Predictor
+from pgexcite.core.rollout import Horizon, Transition
 from pgexcite.core.step import Kernel
 
 Array = NDArray[np.float64]

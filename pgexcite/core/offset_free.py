@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.kalman import Gaussian, unidentified
-from pgexcite.core.prediction import Transition
+from pgexcite.core.rollout import Transition
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,9 @@ from pgexcite.core.iteration import DECREASE, SAME_STATE, SHORTEST, ShootingOpti
 from pgexcite.core.memory import those_under, under
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Solution, Status
-from pgexcite.core.prediction import Horizon, Predictor, Rollout
+from pgexcite.core.prediction import Predictor
 from pgexcite.core.qp import WarmSolver
+from pgexcite.core.rollout import Horizon, Rollout
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,8 @@ from plants import kobbelv, regulated
 
 from pgexcite.core.initialise import initialise
 from pgexcite.core.local import LocalModel
-from pgexcite.core.prediction import Horizon, Predictor
+from pgexcite.core.prediction import Predictor
+from pgexcite.core.rollout import Horizon
 from pgexcite.core.step import Kernel
 from pgexcite.plugins.transfers.field import FieldTransfer
 

@@ -8,7 +8,8 @@ from plants import kobbelv, regulated
 
 from pgexcite.core.codegen import compiler
 from pgexcite.core.events import Fault
-from pgexcite.core.prediction import Horizon, Predictor
+from pgexcite.core.prediction import Predictor
+from pgexcite.core.rollout import Horizon
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.step import Kernel

@@ -12,7 +12,8 @@ from tapped import plant, source
 
 from pgexcite.core.controller import Plant, Surroundings
 from pgexcite.core.errors import ConfigError
-from pgexcite.core.prediction import Horizon, Predictor
+from pgexcite.core.prediction import Predictor
+from pgexcite.core.rollout import Horizon
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.core.step import Kernel

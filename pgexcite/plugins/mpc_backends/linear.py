@@ -32,7 +32,8 @@ from pgexcite.core.memory import as_arrays, those_under, under
 from pgexcite.core.mpc import ControlProblem, Solution, Solver, Status
 from pgexcite.core.nameplate import own_model
 from pgexcite.core.offset_free import Disturbances, Noise, OffsetFreeFilter
-from pgexcite.core.prediction import Horizon, Predictor, Transition
+from pgexcite.core.prediction import Predictor
+from pgexcite.core.rollout import Horizon, Transition
 
 Array = NDArray[np.float64]
 Disturbed = Literal["v_t", "p_e", "q_e", "i_fd", "torque"]

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from pgexcite import load
-from pgexcite.core.prediction import Horizon, Predictor
+from pgexcite.core.prediction import Predictor
+from pgexcite.core.rollout import Horizon
 from pgexcite.core.step import Kernel
 from pgexcite.studies.long_term import Watched, commands_of, long_term_figures
 
