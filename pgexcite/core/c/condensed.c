@@ -5,6 +5,13 @@
 #define N_TRACKED (N_OUTPUTS - N_SOFT)
 #define N_RATES (RATE ? N_V : 0)
 
+static int all_finite(const double *a, int n) {
+    int i;
+    for (i = 0; i < n; i++)
+        if (a[i] - a[i] != 0) return 0;
+    return 1;
+}
+
 /* Within the bounds, and on a bound that is met but for rounding. */
 static double clipped(double value, int i) {
     if (value < LOWER[i] + 1e-12) return LOWER[i];

@@ -1,13 +1,6 @@
-/* Vectors, and dense symmetric positive definite matrices row by row. */
+/* Dense symmetric positive definite matrices, row by row. */
 
 #include <math.h>
-
-static int all_finite(const double *a, int n) {
-    int i;
-    for (i = 0; i < n; i++)
-        if (a[i] - a[i] != 0) return 0;
-    return 1;
-}
 
 /* Cholesky factor of a matrix of order n, in the lower triangle in place; 0 where it is not positive definite. */
 static int cholesky(double *A, int n) {
