@@ -43,7 +43,7 @@ static int ukf_judge(const double *z, Expectation *now, double *surprise, int *c
         ukf_unexplained = ukf_larger(ukf_unexplained - UKF_FORGIVE * UKF_DT, 0);
         return 1;
     }
-    ukf_unexplained += UKF_DT;
+    ukf_unexplained += UKF_BY_CHANGE * UKF_DT;
     ukf_anew = ukf_anew > 0 ? UKF_WARM_UP : 0;
     for (k = 0; k < UKF_N_JUMPS; k++) {
         ukf_changed(UKF_JUMPS + UKF_JUMP_SIZE * k, z[UKF_P_E] - now->z[UKF_P_E], x, P);
@@ -60,6 +60,7 @@ static int ukf_judge(const double *z, Expectation *now, double *surprise, int *c
             return 1;
         }
     }
+    ukf_unexplained += (1 - UKF_BY_CHANGE) * UKF_DT;
     *change = -1;
     return 1;
 }

@@ -31,6 +31,9 @@ _FORGET = 0.3
 """Weight of a sample in the running mean of the normalised innovations squared."""
 _FORGIVE = 0.1
 """Seconds of unexplained measurements that a second of explained ones makes up for."""
+_BY_CHANGE = 0.5
+"""Share of a sample that counts as unexplained where a change of the network had to be assumed. A model that is wrong about its
+machine needs one after the other in a large swing, and its estimates are of use all the same."""
 
 _SWING = 4.0
 """Deviation of the speed that counts as a swing, in standard deviations of its measurement."""
@@ -255,7 +258,7 @@ class _Tracker:
             self._anew = max(self._anew - self._dt, 0.0)
             self._unexplained = max(self._unexplained - _FORGIVE * self._dt, 0.0)
             return expected, surprise, 0
-        self._unexplained += self._dt
+        self._unexplained += _BY_CHANGE * self._dt
         self._anew = options.warm_up if self._anew > 0 else 0.0
         for k, jump in enumerate(_JUMPS):
             x, P = self._network.changed(jump)
@@ -268,6 +271,7 @@ class _Tracker:
                 self._kalman.x, self._kalman.P, self._network.held = x, P, False
                 self._since, self._moving, self._mean = 0.0, options.hold_after, float(len(TERMINALS))
                 return other, left, k + 1
+        self._unexplained += (1 - _BY_CHANGE) * self._dt
         return expected, surprise, -1
 
     def _correct(self, expected: Expectation, z: Array) -> None:
@@ -359,6 +363,7 @@ class _Tracker:
             "limit_mean": options.limit_mean,
             "forget": _FORGET,
             "forgive": _FORGIVE,
+            "by_change": _BY_CHANGE,
             "swing": _SWING * options.noise_omega,
             "held": HELD,
             "lowest": LOWEST,

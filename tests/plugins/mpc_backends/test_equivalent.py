@@ -215,6 +215,17 @@ def test_where_a_sample_is_lost_the_field_voltage_is_what_was_in_force(delayed, 
     assert max(gaps) < 1e-9
 
 
+def test_a_large_swing_of_a_machine_known_wrongly_is_no_divergence():
+    """With an inertia 17 % low in the model, after a fault near its critical clearing time."""
+    exact = ["controller.mpc.measurement.noise=0.0", "controller.mpc.measurement.noise_omega=0.0"]
+    wrong = ["unit.G2.machine.H=3.48", 'controller.mpc.options.model={"unit.G2.machine.H"=2.9}']
+    fault = 'event=[{type="fault", t=1.0, bus="HV", R=0.02, duration=0.3}]'
+    scenario = load(CONFIGS / "smib" / "fault_equivalent.toml", ["simulation.t_end=4", fault, *exact, *wrong])
+    sim = Simulation(scenario.system, scenario.settings, scenario.changes, scenario.controllers)
+    assert sim.run().ending.value == "completed"
+    assert sim.trace()["controller.mpc.level"].max() == 0
+
+
 def test_a_delay_that_is_known_is_made_up_for():
     """Damping of the swing, weights that damp: prompt 0.188, late 0.107, late and known 0.183."""
     exact = ["controller.mpc.measurement.noise=0.0", "controller.mpc.measurement.noise_omega=0.0"]
