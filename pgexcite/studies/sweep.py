@@ -16,7 +16,7 @@ A study file names scenarios and what is varied:
     [[factor]]                                # under what: one case per variant and factor
     name = "x_s x 2"
     set = ["line.L1.X=0.3"]
-    only = { nmpc = ["controller.mpc.options.mismatch={...}"] }   # further overrides of single variants
+    only = { "nmpc*" = ["controller.mpc.options.mismatch={...}"] }   # further overrides of variants whose names match
 
     [clearing]                                # where wanted: the critical clearing time of every case, too
     tolerance = 0.0025
@@ -35,6 +35,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,9 @@ class Factor(_Table):
 
     name: str
     overrides: tuple[str, ...] = Field((), alias="set", description="overrides of every variant")
-    only: Mapping[str, tuple[str, ...]] = Field(default_factory=dict, description="further overrides by variant")
+    only: Mapping[str, tuple[str, ...]] = Field(
+        default_factory=dict, description="further overrides by variant, or by pattern (nmpc*)"
+    )
 
 
 class Clearing(_Table):
@@ -134,10 +137,12 @@ def cases(path: Path) -> tuple[str, list[Case]]:
     found: list[Case] = []
     problems: list[Problem] = []
     for factor in (Factor.model_validate({"name": NOMINAL}), *study.factor):
-        unknown = set(factor.only) - set(study.variant)
+        # A pattern may match nothing: studies of different variants include the same factors.
+        unknown = {name for name in factor.only if "*" not in name} - set(study.variant)
         problems += [Problem(f"factor.{factor.name}.only", f"there is no variant {name!r}") for name in sorted(unknown)]
         for name, variant in study.variant.items():
-            overrides = (*study.common, *variant.overrides, *factor.overrides, *factor.only.get(name, ()))
+            own = [text for pattern, more in factor.only.items() if fnmatchcase(name, pattern) for text in more]
+            overrides = (*study.common, *variant.overrides, *factor.overrides, *own)
             scenario = path.parent / variant.base
             try:
                 resolved = load(scenario, overrides).resolved
