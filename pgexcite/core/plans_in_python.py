@@ -55,6 +55,7 @@ class PlansInPython:
         self._prepared: _Prepared | None = None
         self._curvature: Curvature | None = None
         self._from: tuple[State, float, Array] | None = None
+        predictor.make_ready()
         owned = {*self.problem.commands, *self.problem.fixed}
         self._others = np.array([path not in owned for path in self.kernel.model.u_names], dtype=bool)
 

@@ -74,6 +74,10 @@ class Predictor:
         library = self.kernel.library(source, called)
         return None if library is None else load(library)
 
+    def make_ready(self) -> None:
+        """Compile now what would be compiled for the first prediction, which may have a deadline."""
+        _ = self._library
+
     def constants(self, *, transitions: bool) -> dict[str, object]:
         """What ``rollout.c`` needs to know, with derivatives in this way."""
         n_x, n_u = self._n_x, self.commands.size

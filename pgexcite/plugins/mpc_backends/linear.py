@@ -140,6 +140,7 @@ class _Linear:
         self._point_0 = kernel.settle(initial.state.with_(u=u), p) or initial.state
         positions = [model.position("y", path) for path in outputs]
         predictor = Predictor(kernel, self._commands, positions, problem.N_c, surroundings.rule, transitions=True)
+        predictor.make_ready()
         self._local = LocalModel(kernel, self._commands, predictor, self._point_0)
         self._y_0, self._C_0, _ = predictor.outputs(self._point_0, p)
         # The plant minus the model at the initial point; nobody tells what is not measured.
