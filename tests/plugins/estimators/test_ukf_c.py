@@ -75,7 +75,6 @@ class Filters:
             filter=codegen.loop("dense.c") + written.text,
         )
         (folder / "filter.c").write_text(program)
-        # The filter alone has no use for all of dense.c.
         strict = [
             "-std=c99",
             "-O1",
