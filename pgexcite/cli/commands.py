@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,23 @@ from pgexcite.core.errors import AssemblyError, ConfigError, InitialisationError
 EXIT_CONFIG = 3
 EXIT_INITIALISATION = 4
 EXIT_OUTCOME = 5
+EXIT_INTERRUPTED = 130
 _EXIT: tuple[tuple[type[PgexciteError], int], ...] = (
     (InitialisationError, EXIT_INITIALISATION),
     (ConfigError, EXIT_CONFIG),
     (RegistryError, EXIT_CONFIG),
     (AssemblyError, EXIT_CONFIG),
 )
+_INTERRUPTED = {
+    "run": ": no record was written",
+    "realtime": ": no record was written",
+    "study": ": the cases that are done are kept; the same command goes on",
+}
+"""What became of the work, by command."""
 
 
 class _Commands(click.Group):
-    """Turns the project's errors into a message and an exit code; a traceback is left to bugs."""
+    """Turns the project's errors and the system's into a message and an exit code; a traceback is left to bugs."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -30,6 +38,25 @@ class _Commands(click.Group):
         except PgexciteError as error:
             click.echo(f"error: {error}", err=True)
             ctx.exit(next((code for kind, code in _EXIT if isinstance(error, kind)), 1))
+        except OSError as error:
+            if isinstance(error, BrokenPipeError):
+                raise  # whoever read our output is gone; click ends quietly
+            click.echo(f"error: {error.filename or 'the system'}: {error.strerror or error}", err=True)
+            ctx.exit(1)
+        except KeyboardInterrupt:
+            kept = _INTERRUPTED.get(ctx.invoked_subcommand or "", "")
+            click.echo(f"interrupted{kept}", err=True)
+            ctx.exit(EXIT_INTERRUPTED)
+
+
+class _Finite(click.FloatRange):
+    """A range without NaN, which compares as within any, and without infinity."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{number} is not a finite number.", param, ctx)
+        return float(number)
 
 
 _config = click.argument("config", type=click.Path(path_type=Path, dir_okay=False))
@@ -43,7 +70,7 @@ _json = click.option("--json", "as_json", is_flag=True, help="Print the figures 
     cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog="Exit codes: 0 as expected, 1 other failure, 2 usage, 3 configuration, 4 initialisation, "
-    "5 a run that ended otherwise than its scenario expects.",
+    "5 a run that ended otherwise than its scenario expects, 130 interrupted.",
 )
 @click.version_option(package_name="pgexcite")
 def main() -> None:
@@ -56,7 +83,7 @@ def main() -> None:
 @_set
 @click.option("--live", is_flag=True, help="Serve the run to a viewer while it goes on.")
 @click.option("--resume", type=click.Path(path_type=Path, dir_okay=False), help="Go on from a snapshot.")
-@click.option("--snapshot-at", type=float, metavar="T", help="Keep a snapshot of time T (s) in the record.")
+@click.option("--snapshot-at", type=_Finite(min=0), metavar="T", help="Keep a snapshot of time T (s) in the record.")
 @_json
 def run(
     config: Path,
@@ -74,6 +101,11 @@ def run(
     from pgexcite.core.summary import summarise
 
     scenario = load(config, overrides)
+    end = scenario.settings.t_end
+    if snapshot_at is not None and snapshot_at > end:
+        raise click.BadParameter(
+            f"{snapshot_at:g} s is after the end of the run at {end:g} s", param_hint="--snapshot-at"
+        )
     show.remarks(scenario)
     directory = out or Path("runs") / config.stem
     ensure_replaceable(directory)
@@ -90,14 +122,14 @@ def run(
 @_config
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Directory of the record [runs/CONFIG].")
 @_set
-@click.option("--period", type=click.FloatRange(min=0, min_open=True), help="Wall time of a period, s [sample time].")
+@click.option("--period", type=_Finite(min=0, min_open=True), help="Wall time of a period, s [sample time].")
 @click.option("--steps", type=click.IntRange(min=1), help="Periods to run [to the end of the scenario].")
-@click.option("--deadline", type=click.FloatRange(min=0, min_open=True), help="ms; a plan later than that is not used.")
+@click.option("--deadline", type=_Finite(min=0, min_open=True), help="ms; a plan later than that is not used.")
 @click.option("--priority", type=click.IntRange(1, 99), help="Run under SCHED_FIFO with this priority.")
 @click.option("--lock-memory", is_flag=True, help="Keep all pages in memory.")
 @click.option("--core", type=click.IntRange(min=0), help="Processor to stay on.")
 @click.option("--gc", "garbage", type=click.Choice(["on", "frozen", "off"]), default="on", show_default=True)
-@click.option("--keep", type=click.FloatRange(min=0), help="Simulated seconds kept in the trace [all].")
+@click.option("--keep", type=_Finite(min=0), help="Simulated seconds kept in the trace [all].")
 @_json
 def realtime(
     config: Path,
@@ -211,9 +243,7 @@ def eig(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
 @main.command()
 @_config
 @_set
-@click.option(
-    "--tolerance", type=click.FloatRange(min=1e-6), default=1e-4, show_default=True, help="Width of the bracket, s."
-)
+@click.option("--tolerance", type=_Finite(min=1e-6), default=1e-4, show_default=True, help="Width of the bracket, s.")
 @_json
 def cct(config: Path, overrides: tuple[str, ...], tolerance: float, as_json: bool) -> None:
     """Critical clearing time of the scenario's fault, by bisection."""
@@ -236,7 +266,9 @@ def cct(config: Path, overrides: tuple[str, ...], tolerance: float, as_json: boo
 @main.command(name="equal-area")
 @_config
 @_set
-@click.option("--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw the construction into this file.")
+@click.option(
+    "--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw the construction into this file (PNG)."
+)
 @_json
 def equal_area(config: Path, overrides: tuple[str, ...], figure: Path | None, as_json: bool) -> None:
     """Equal-area construction of the scenario's fault, for one machine against an infinite bus."""
@@ -260,7 +292,7 @@ def equal_area(config: Path, overrides: tuple[str, ...], figure: Path | None, as
     "--tan-phi", "tangents", multiple=True, type=float, help="Q/P given to these loads; may be repeated [own]."
 )
 @click.option("--bus", help="Bus whose voltage is drawn [the weakest].")
-@click.option("--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw the curves into this file.")
+@click.option("--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw the curves into this file (PNG).")
 @click.option("--per-unit", is_flag=True, help="Powers in per unit of S_base instead of MW and Mvar.")
 @_json
 def pv(

@@ -142,7 +142,13 @@ class State:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 content = {key: data[key] for key in data.files}
         except (OSError, ValueError, EOFError, BadZipFile) as cause:
-            raise SnapshotError(f"{path}: not a snapshot that can be read ({cause})") from cause
+            # NumPy takes whatever is no archive for pickled objects, which is no news to who named the wrong file.
+            reason = (
+                cause.strerror
+                if isinstance(cause, OSError) and cause.strerror
+                else "not an archive of arrays, or cut short"
+            )
+            raise SnapshotError(f"{path}: not a snapshot that can be read ({reason})") from cause
         missing = {"fingerprint", "k", "t", "startup", "x", "z", "d", "u", "p"} - content.keys()
         if missing:
             raise SnapshotError(f"{path}: not a snapshot, {', '.join(sorted(missing))} missing")

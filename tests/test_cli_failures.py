@@ -1,0 +1,80 @@
+"""What the system or the person at the terminal refuses: a message and an exit code, no traceback, nothing half written."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from pgexcite.cli import main
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+SMIB = CONFIGS / "smib"
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, [str(item) for item in arguments])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("export-c", SMIB / "fault_nmpc.toml"),
+        ("study", CONFIGS / "studies" / "mismatch.toml", "--out"),
+        ("equal-area", SMIB / "clearing_arc.toml", "--figure"),
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_what_cannot_be_written_is_named(arguments, tmp_path):
+    (tmp_path / "file").write_text("not a directory")
+    result = call(*arguments, tmp_path / "file" / "below")
+    assert result.exit_code == 1, result.output
+    assert result.stderr.startswith(f"error: {tmp_path / 'file'}")
+    assert isinstance(result.exception, SystemExit)
+
+
+@pytest.mark.parametrize(
+    ("time", "reason"),
+    [
+        ("11", "11 s is after the end of the run at 10 s"),
+        ("-1", "not in the range"),
+        ("nan", "nan is not a finite number"),
+    ],
+)
+def test_a_snapshot_at_a_time_outside_the_run_is_refused(time, reason, tmp_path):
+    result = call("run", SMIB / "fault_constant.toml", "--snapshot-at", time, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert reason in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_no_snapshot_is_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("no archive")
+    for name, reason in (("text.npz", "not an archive of arrays"), ("absent.npz", "No such file or directory")):
+        result = call("run", SMIB / "fault_constant.toml", "--resume", tmp_path / name, "--out", tmp_path / "out")
+        assert result.exit_code == 1
+        assert f"{name}: not a snapshot that can be read ({reason}" in result.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
+    ready = tmp_path / "ready"
+    program = (
+        "import pathlib, sys\n"
+        "from pgexcite.cli import main, running\n"
+        "run = running.Simulation.run\n"
+        f"running.Simulation.run = lambda *a, **k: (pathlib.Path({str(ready)!r}).touch(), run(*a, **k))[1]\n"
+        "main(sys.argv[1:])\n"
+    )
+    arguments = ["run", SMIB / "fault_nmpc.toml", "--set", "simulation.t_end=1e6", "--out", tmp_path / "out"]
+    process = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.PIPE, text=True)
+    while not ready.exists() and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert stderr.strip() == "interrupted: no record was written"
+    assert not (tmp_path / "out").exists()
