@@ -210,7 +210,7 @@ WIDE = tuple(f"unit.G{k}.stabiliser.{limit}" for k in UNITS for limit in ("V_SMA
 OTHER_SUPPLY = {
     "stabilisers": ("fault_thyristor_pss", INDEPENDENT, None),
     "stabilisers with wide limits, from the terminals": ("fault_thyristor_pss", WIDE, 2.56),
-    "nmpc": ("fault_nmpc", FROM_THE_TERMINALS, 2.54),
+    "nmpc": ("fault_nmpc", FROM_THE_TERMINALS, 2.67),
     "nmpc, one move": ("fault_nmpc", (*FROM_THE_TERMINALS, *ONE_MOVE), 2.85),
     "secondary": ("fault_linear_secondary", INDEPENDENT, None),
     "secondary, one move": ("fault_linear_secondary", (*INDEPENDENT, *ONE_MOVE), 4.44),
