@@ -63,6 +63,10 @@ class Horizons:
         """Its first interval alone, in the plant's own steps."""
         return self._cut(self._sample, t, u, p)
 
+    def on_grid(self, length: float) -> float:
+        """A piece's step, and the plant's own where it is that but for rounding: timers are expected to the last bit."""
+        return self.grid if abs(length - self.grid) < 1e-9 * self.grid else float(length)
+
     @cached_property
     def _whole(self) -> _Plain:
         problem = self.problem

@@ -267,7 +267,7 @@ def a_sample_later(
                     return None
                 state = settled
             row = int(k)
-        segment = kernel.advance(state, horizon.p[k], predictor.rule, float(h), int(count))
+        segment = kernel.advance(state, horizon.p[k], predictor.rule, horizons.on_grid(h), int(count))
         if segment.failed:
             return None
         state = segment.state

@@ -75,6 +75,7 @@ def horizon(horizons: Horizons) -> tuple[dict[str, object], dict[str, Numbers]]:
     constants: dict[str, object] = {
         "first_count": max(1, round(problem.dt / horizons.h)),
         "sample_steps": max(1, round(problem.dt / horizons.grid)),
+        "grid": horizons.grid,
         "n_fixed": len(fixed),
         "n_known": len(problem.known),
     }

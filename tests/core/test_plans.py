@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import kobbelv, regulated
+from plants import REGULATED, kobbelv, regulated, two_units
 
 from pgexcite.core.codegen import compiler
 from pgexcite.core.events import Fault
@@ -13,6 +13,8 @@ from pgexcite.core.plans_in_python import PlansInPython
 from pgexcite.core.settings import Settings
 from pgexcite.core.simulate import Simulation
 from pgexcite.plugins.controllers.mpc import MPC
+from pgexcite.plugins.exciters.sexs import SEXS
+from pgexcite.plugins.limiters.oel import OEL
 
 FAULT = Fault(type="fault", t=0.2, bus="HV", R=0.02, duration=0.1)
 SECONDARY = {"command": "v_ref", "u_min": 0.9, "u_max": 1.05, "dt": 0.1, "V_ref": 0.99}
@@ -113,6 +115,46 @@ def test_each_takes_up_what_the_other_remembers(kind, t):
         assert all(np.array_equal(kept[name], after[name]) for name in names)
     sim.run()
     assert plans.off < 1e-9
+
+
+def limited(dt, h, **options):
+    """A regulator whose limiter counts and acts; the horizon has both in it."""
+    exciter = REGULATED["exciter"].model_copy(update={"oel_position": 1})
+    system = regulated(exciter=exciter, oel=OEL(acts="summing", I_LIM=2.0, T_LIM=0.12, T_RESET=0.1))
+    sag = Fault(type="fault", t=0.15, bus="HV", R=0.2, duration=0.15).changes()
+    mpc = MPC(**{**SECONDARY, "unit": "G2", "dt": dt, "u_max": 1.1, "V_ref": 1.05, **options})
+    return Simulation(system, Settings(1.5, h, "tr_bdf2", "always"), sag, {"mpc": mpc})
+
+
+@pytest.mark.parametrize("N_c", [2, 12])
+@pytest.mark.parametrize(("dt", "h"), [(0.1, 0.005), (0.0375, 0.0125)])
+def test_limiters_count_in_c_as_in_python_and_in_the_plant(dt, h, N_c):
+    """Timers are expected to the last bit, whatever the sample time over the step comes to in floating point."""
+    sim = limited(dt, h, N_p=12, N_c=N_c)
+    plans = watched(sim)
+    counted = 0
+    for t in np.arange(dt, 1.5, dt):
+        sim.run(until=t)
+        if t - dt < 0.3 - 1e-9 and t > 0.15:
+            continue  # nobody expects the fault
+        counted += sim.state.d[0] > 0
+        for each in (plans.acting, plans.watching):
+            assert np.array_equal(each.memory()["prepared:d"], sim.state.d)
+    assert plans.off < 1e-9  # measured 6e-15
+    assert counted > 5
+    assert np.ptp(sim.trace()["unit.G2.oel.active"]) == 1
+
+
+def test_plans_of_two_units_in_c_are_those_of_python():
+    mpc = MPC(
+        unit=("G1", "G2"), **{**SECONDARY, "u_min": 0.8, "u_max": 1.2, "dt": 0.05, "V_ref": [1.0, 1.02]}, N_p=6, N_c=3
+    )
+    fault = Fault(type="fault", t=0.2, bus="L", R=0.02, duration=0.1).changes()
+    sim = Simulation(two_units(exciter=SEXS()), Settings(0.8, 0.005, "tr_bdf2", "always"), fault, {"mpc": mpc})
+    plans = watched(sim)
+    sim.run()
+    assert plans.off < 1e-9  # measured 2e-12
+    assert np.ptp(plans.plans, axis=0).min() > 0.01
 
 
 def test_without_a_state_nothing_is_prepared():

@@ -35,15 +35,19 @@ static void add_row(int change, Horizon *to) {
     to->rows++;
 }
 
-/* A piece of this duration in equal steps of about h; none for a duration of zero that ends no sample. */
-static void add_piece(double duration, double h, int move, int end, Horizon *to) {
-    double steps = ceil(duration / h - 1e-6);
-    if (duration <= SAME_INSTANT && !end) return;
-    to->count[to->pieces] = steps > 1 ? (int)steps : 1;
-    to->length[to->pieces] = duration / to->count[to->pieces];
+static void add_steps(int count, double length, int move, int end, Horizon *to) {
+    to->count[to->pieces] = count;
+    to->length[to->pieces] = length;
     to->move[to->pieces] = move;
     to->row[to->pieces] = to->rows - 1;
     to->end[to->pieces++] = end;
+}
+
+/* A piece of this duration in equal steps of about h; none for a duration of zero that ends no sample. */
+static void add_piece(double duration, double h, int move, int end, Horizon *to) {
+    double steps = ceil(duration / h - 1e-6);
+    int count = steps > 1 ? (int)steps : 1;
+    if (duration > SAME_INSTANT || end) add_steps(count, duration / count, move, end, to);
 }
 
 /* From t on, with these commands and parameters in force; each interval in this many steps. */
@@ -57,13 +61,18 @@ static void horizon_at(double t, const double *u, const double *p, int steps, Ho
     while (next < N_KNOWN && KNOWN_T[next] <= t + SAME_INSTANT) next++;
     while (until > next && KNOWN_T[until - 1] >= last - SAME_INSTANT) until--;
     for (j = 0; j < HORIZON; j++) {
+        const int rows = to->rows;
         double end = t + ENDS[j], h = INTERVALS[j] / steps;
         for (; next < until && KNOWN_T[next] < end - SAME_INSTANT; next++) {
             add_piece(KNOWN_T[next] - here, h, SAMPLE_MOVE[j], 0, to);
             add_row(next, to);
             if (KNOWN_T[next] > here) here = KNOWN_T[next];
         }
-        add_piece(end - here, h, SAMPLE_MOVE[j], 1, to);
+        /* What is not cut has the same steps at any t, to the last bit: what was prepared for steps of this length serves on. */
+        if (to->rows == rows)
+            add_steps(steps, h, SAMPLE_MOVE[j], 1, to);
+        else
+            add_piece(end - here, h, SAMPLE_MOVE[j], 1, to);
         here = end;
         for (; next < until && KNOWN_T[next] <= end + SAME_INSTANT; next++) add_row(next, to);
     }

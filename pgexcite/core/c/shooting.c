@@ -78,6 +78,9 @@ static int step_on(Point *at, const double *p, double h, int count) {
     return 1;
 }
 
+/* A piece's step, and the plant's own where it is that but for rounding: timers are expected to the last bit. */
+static double on_grid(double length) { return fabs(length - GRID) < 1e-9 * GRID ? GRID : length; }
+
 /* One sample in the plant's own steps under these commands, from t, with all that is known to happen by its end; p too is moved
    on. */
 static int advance(Point *at, double t, double *p, const double *commands) {
@@ -95,7 +98,7 @@ static int advance(Point *at, double t, double *p, const double *commands) {
             for (i = 0; i < N_COMMANDS; i++) wanted[COMMANDS[i]] = commands[i];
             if ((!first || differ(wanted, at->u, N_U)) && !settle_at(at, wanted, row_p)) return 0;
         }
-        if (!step_on(at, row_p, over.length[j], over.count[j])) return 0;
+        if (!step_on(at, row_p, on_grid(over.length[j]), over.count[j])) return 0;
     } while (!over.end[j++]);
     memcpy(wanted, over.u, sizeof(double) * N_U);
     between(t, t + ENDS[0], wanted, p);
