@@ -40,8 +40,12 @@ def study(config: Path, out: Path | None, workers: int, as_json: bool) -> None:
     found = run_study(config, out or Path("runs") / config.stem, workers=workers, progress=progress)
     if as_json:
         show.json({"title": found.title, "rows": found.rows, "directory": str(found.directory)})
-        return
-    click.echo(found.title)
-    columns = ("variant", "factor", *FIGURES, "error")
-    show.table([{key: row[key] for key in columns if key in row} for row in found.rows])
-    click.echo(f"figures of every case: {found.directory}")
+    else:
+        click.echo(found.title)
+        columns = ("variant", "factor", *FIGURES, "error")
+        show.table([{key: row[key] for key in columns if key in row} for row in found.rows])
+        click.echo(f"figures of every case: {found.directory}")
+    failed = sum("error" in row for row in found.rows)
+    if failed:
+        click.echo(f"error: {failed} of {len(found.rows)} cases could not be run", err=True)
+        click.get_current_context().exit(1)

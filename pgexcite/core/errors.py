@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+_LONGEST = 120
+"""Characters shown of a value; a table where a number should be would bury its message."""
+
 
 class PgexciteError(Exception):
     """Base of every error this package raises on purpose."""
@@ -27,7 +30,9 @@ class Problem:
     hint: str = ""
 
     def __str__(self) -> str:
-        shown = "" if self.value is None else f" (got {self.value!r})"
+        text = repr(self.value)
+        text = text if len(text) <= _LONGEST else f"{text[: _LONGEST - 4]} ..."
+        shown = "" if self.value is None else f" (got {text})"
         hint = f"; {self.hint}" if self.hint else ""
         return f"{self.path}: {self.message}{shown}{hint}"
 

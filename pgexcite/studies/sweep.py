@@ -39,10 +39,12 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from pgexcite.core.config import load, read
+from pgexcite.core.config.validate import Collector
 from pgexcite.core.errors import ConfigError, PgexciteError, Problem
+from pgexcite.core.registry import nearest
 from pgexcite.core.summary import summarise
 from pgexcite.studies.cct import critical_clearing_time
 from pgexcite.studies.measures import swing_figures
@@ -65,7 +67,7 @@ class Variant(_Table):
 class Factor(_Table):
     """A circumstance all variants are put under."""
 
-    name: str
+    name: str = Field(description="name of the circumstance")
     overrides: tuple[str, ...] = Field((), alias="set", description="overrides of every variant")
     only: Mapping[str, tuple[str, ...]] = Field(
         default_factory=dict, description="further overrides by variant, or by pattern (nmpc*)"
@@ -82,11 +84,11 @@ class Clearing(_Table):
 class StudyFile(_Table):
     """A study as written in a file."""
 
-    title: str = ""
+    title: str = Field("", description="what it shows, in a line")
     unit: str = Field(description="unit whose figures are taken")
     common: tuple[str, ...] = Field((), description="overrides of every case")
-    variant: Mapping[str, Variant]
-    factor: tuple[Factor, ...] = ()
+    variant: Mapping[str, Variant] = Field(min_length=1, description="what is compared, each as [variant.NAME]")
+    factor: tuple[Factor, ...] = Field((), description="what the variants are put under, each as [[factor]]")
     clearing: Clearing | None = Field(None, description="search for critical clearing times, where wanted")
 
 
@@ -125,15 +127,21 @@ def cases(path: Path) -> tuple[str, list[Case]]:
     Raises:
         ConfigError: with every problem of the study and of its scenarios.
     """
-    try:
-        study = StudyFile.model_validate(dict(read(path)))
-    except ValidationError as error:
+    data = read(path)
+    if "simulation" in data and "variant" not in data:
         raise ConfigError(
             [
-                Problem(".".join(str(part) for part in e["loc"]) or str(path), e["msg"], e.get("input"))
-                for e in error.errors()
+                Problem(
+                    str(path),
+                    "is a scenario, not a study",
+                    hint="run it with `pgexcite run`, or name it as the base of a variant",
+                )
             ]
-        ) from error
+        )
+    collect = Collector()
+    study = collect.validate(StudyFile, data, "", strict=None)
+    if study is None:
+        raise ConfigError(collect.problems)
     found: list[Case] = []
     problems: list[Problem] = []
     for factor in (Factor.model_validate({"name": NOMINAL}), *study.factor):
@@ -145,14 +153,19 @@ def cases(path: Path) -> tuple[str, list[Case]]:
             overrides = (*study.common, *variant.overrides, *factor.overrides, *own)
             scenario = path.parent / variant.base
             try:
-                resolved = load(scenario, overrides).resolved
+                loaded = load(scenario, overrides)
             except ConfigError as error:
                 problems += [
                     Problem(f"{name}/{factor.name}: {p.path}", p.message, p.value, p.hint) for p in error.problems
                 ]
                 continue
+            units = [item.path.removeprefix("unit.") for item in loaded.system.devices if item.path.startswith("unit.")]
+            if study.unit not in units:
+                hint = nearest(study.unit, units)
+                problems.append(Problem("unit", f"there is no such unit in {variant.base}", study.unit, hint))
+                continue
             search = study.clearing.model_dump() if study.clearing else None
-            content = json.dumps([resolved, study.unit, search], sort_keys=True, default=str)
+            content = json.dumps([loaded.resolved, study.unit, search], sort_keys=True, default=str)
             key = hashlib.sha256(content.encode()).hexdigest()[:16]
             found.append(Case(name, factor.name, scenario.resolve(), overrides, study.unit, key, study.clearing))
     if problems:
@@ -170,8 +183,6 @@ def run_case(case: Case) -> dict[str, Any]:
         return {"error": str(error)}
     result = simulation.result(scenario.title, scenario.resolved)
     summary = summarise(result)
-    if case.unit not in summary["units"]:
-        return {"error": f"there is no unit {case.unit!r} in {case.path.name}"}
     controllers = summary["controllers"].values()
     return {
         "outcome": summary["outcome"],

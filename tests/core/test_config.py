@@ -7,6 +7,7 @@ import pytest
 
 from pgexcite import ConfigError, load
 from pgexcite.core.config import from_data, json_schema, merge, remarks
+from pgexcite.core.errors import Problem
 from pgexcite.core.trace import Ending
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -134,6 +135,28 @@ def test_an_override_that_leads_nowhere(override, path, expected):
     (problem,) = caught.value.problems
     assert problem.path == path
     assert expected in str(problem)
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("noise=nan", "noise: should be a finite number (got nan); it is the standard deviation of voltages, currents"),
+        ("noise=-1", "noise: should be greater than or equal to 0 (got -1); it is the standard deviation of voltages"),
+        ("nois=1", "nois: unknown key (got 1); did you mean 'noise'?"),
+    ],
+)
+def test_keys_of_a_table_in_a_table_are_told_by_their_own_names(override, expected):
+    with pytest.raises(ConfigError) as caught:
+        load(SMIB / "fault_equivalent.toml", [f"controller.mpc.measurement.{override}"])
+    (problem,) = caught.value.problems
+    assert str(problem).startswith(f"controller.mpc.measurement.{expected}")
+
+
+def test_a_long_value_does_not_bury_its_message():
+    text = str(Problem("unit", "should be a number", {f"key {k}": k for k in range(1000)}, "remove it"))
+    assert text.startswith("unit: should be a number (got {'key 0': 0, ")
+    assert text.endswith(" ...); remove it")
+    assert len(text) < 200
 
 
 WRONG = [

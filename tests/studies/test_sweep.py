@@ -8,7 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from pgexcite.cli import main
 from pgexcite.core.errors import ConfigError
 from pgexcite.studies import sweep
 
@@ -76,6 +78,47 @@ def test_a_mistake_anywhere_stops_the_study_before_it_runs(study_file, tmp_path)
     assert "st1a/nominal: unit.G2.exciter.K_a" in text
     assert "there is no variant 'st1b'" in text
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            'unit = "G2"',
+            'unti = "G2"',
+            ["unti: unknown key (got 'G2'); did you mean 'unit'?", "unit: is required: unit"],
+        ),
+        ('unit = "G2"', 'unit = "G3"', ["unit: there is no such unit in", "(got 'G3'); did you mean 'G2'?"]),
+        (
+            'base = "',
+            'bse = "',
+            ["variant.st1a.bse: unknown key", "did you mean 'base'?", "base: is required: scenario"],
+        ),
+        ("[variant", "[vary", ["variant: is required: what is compared", "vary: unknown key"]),
+    ],
+)
+def test_mistakes_of_a_study_are_told_as_those_of_a_scenario(study_file, tmp_path, old, new, expected):
+    study_file.write_text(study_file.read_text().replace(old, new))
+    result = CliRunner().invoke(main, ["study", str(study_file), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 3
+    for text in expected:
+        assert text in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scenario_is_told_from_a_study(pytestconfig, tmp_path):
+    scenario = pytestconfig.rootpath / "configs" / "smib" / "fault_nmpc.toml"
+    with pytest.raises(ConfigError, match="is a scenario, not a study; run it with `pgexcite run`"):
+        sweep.run_study(scenario, tmp_path / "out")
+
+
+def test_a_case_that_cannot_be_run_is_an_exit_code_too(study_file, tmp_path):
+    text = study_file.read_text().split("[[factor]]")[0]
+    study_file.write_text(text.replace("K_A=150", "V_RMAX=1.0"))
+    result = CliRunner().invoke(main, ["study", str(study_file), "--out", str(tmp_path / "out"), "--workers", "1"])
+    assert result.exit_code == 1
+    assert "the initial operating point cannot be reached" in result.stdout
+    assert "1 of 2 cases could not be run" in result.stderr
 
 
 def die_in_one_case(case):

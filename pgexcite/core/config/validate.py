@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from pgexcite.core import registry
 from pgexcite.core.errors import Problem, RegistryError
@@ -72,20 +74,37 @@ def _translate(error: Mapping[str, Any], cls: type[BaseModel], path: str, also: 
     """One of pydantic's errors as ours."""
     loc, value = error["loc"], error["input"]
     where = ".".join([path, *map(str, loc)] if path else map(str, loc))
-    fields = {info.alias or name: info for name, info in cls.model_fields.items()}
-    field = fields.get(str(loc[0])) if loc else None
+    siblings, field = _place(cls, loc)
     meaning = (field.description or "") if field else ""
     extra = field.json_schema_extra if field else None
     unit = f" [{extra['unit']}]" if isinstance(extra, dict) and "unit" in extra else ""
     if error["type"] == "extra_forbidden":
-        hint = registry.nearest(str(loc[-1]), [*fields, *also]) if len(loc) == 1 else "remove it"
-        return Problem(where, "unknown key", value, hint)
+        known = [*siblings, *also] if len(loc) == 1 else siblings
+        return Problem(where, "unknown key", value, registry.nearest(str(loc[-1]), known) if known else "remove it")
     if error["type"] == "missing":
         return Problem(where, f"is required{': ' * bool(meaning)}{meaning}{unit}")
     if error["type"] == "value_error":
         return Problem(where, str(error["ctx"]["error"]), None if isinstance(value, dict) else value)
     message = str(error["msg"]).removeprefix("Input ")
     return Problem(where, message, value, f"it is the {meaning}{unit}" if meaning else "")
+
+
+def _place(cls: type[BaseModel], loc: Iterable[str | int]) -> tuple[list[str], FieldInfo | None]:
+    """Keys of the innermost table a location leads into, and the field it leads to there, if any."""
+    kind: Any = cls
+    keys: list[str] = []
+    field: FieldInfo | None = None
+    for part in loc:
+        inner = [item for item in get_args(kind) if item not in (Ellipsis, NoneType)]
+        if get_origin(kind) in (Union, UnionType) and len(inner) == 1:
+            kind = inner[0]
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            fields = {info.alias or name: info for name, info in kind.model_fields.items()}
+            keys, field = list(fields), fields.get(str(part))
+            kind = field.annotation if field else None
+        else:  # the name of an entry, its number, or one of the kinds a value may have
+            kind = inner[-1] if inner else None
+    return keys, field
 
 
 def plain(record: BaseModel) -> dict[str, Any]:
