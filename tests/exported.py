@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pgexcite.core import codegen
+from pgexcite.core import compiling
 from pgexcite.core.config import Scenario
 from pgexcite.core.controller import Sample
 from pgexcite.core.export.recorder import Recorder
@@ -21,7 +21,7 @@ STRICT = ["-std=c99", "-O1", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror",
 
 
 def compiler() -> str:
-    cc = codegen.compiler()
+    cc = compiling.compiler()
     assert cc is not None, "these tests need a C compiler"
     return cc
 

@@ -1,20 +1,11 @@
-"""The stepping loop as generated C: the same functions, the same order of operations, compiled once and cached by content.
-
-No compiler means slower, never broken: the caller then keeps to CasADi's virtual machine.
-"""
+"""Models written as C: the same functions in the same order of operations, below loops written by hand."""
 
 from __future__ import annotations
 
-import ctypes
-import hashlib
 import os
-import platform
 import re
-import shutil
-import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,43 +15,11 @@ from numpy.typing import NDArray
 
 from pgexcite.core.errors import PgexciteError
 
-Array = NDArray[np.float64]
-
-FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off", "-w")
-"""Without contraction into fused multiply-adds the numbers are those of the virtual machine, with whatever vectors there are."""
-
 _LOOPS = Path(__file__).parent / "c"
 
 
 class CompilationError(PgexciteError):
     """C code was asked for and could not be had."""
-
-
-def compiler() -> str | None:
-    """The C compiler: ``$CC``, ``cc`` or ``gcc``, whichever is there first; ``None`` without one."""
-    for name in (os.environ.get("CC"), "cc", "gcc", "clang"):
-        if name and shutil.which(name):
-            return shutil.which(name)
-    return None
-
-
-@cache
-def processor() -> tuple[tuple[str, ...], str]:
-    """Flags for this processor's own vectors, and what tells it from others: a library with them must not run elsewhere."""
-    known = Path("/proc/cpuinfo")
-    if platform.machine() not in ("x86_64", "AMD64") or not known.exists():
-        return (), ""
-    features = next((line for line in known.read_text(errors="replace").splitlines() if line.startswith("flags")), "")
-    return ("-march=native",), features
-
-
-def cache_directory() -> Path:
-    """Where compiled libraries are kept: ``$PGEXCITE_CACHE``, else the user's cache directory."""
-    chosen = os.environ.get("PGEXCITE_CACHE")
-    if chosen:
-        return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "pgexcite"
 
 
 def generate(
@@ -106,7 +65,7 @@ def number(value: Any) -> str:
     value = float(value)
     if np.isfinite(value):
         return repr(value)
-    return "INFINITY" if value > 0 else "-INFINITY"
+    return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
 
 
 def loop(name: str) -> str:
@@ -213,72 +172,9 @@ def _linear(function: ca.Function, operation: int, operands: list[tuple[str, boo
     """An operation on operands by name, each with whether it has lanes."""
     names = [f"({name})" if name.startswith("-") else name for name, _ in operands]
     wide = [is_wide for _, is_wide in operands]
-    kept = operation in (ca.OP_MUL, ca.OP_DIV, ca.OP_IF_ELSE_ZERO)
-    if operation not in _LINEAR or (kept and all(wide)) or (operation == ca.OP_DIV and wide[1]):
+    bent = {ca.OP_MUL: all(wide), ca.OP_DIV: wide[-1], ca.OP_IF_ELSE_ZERO: wide[0]}
+    if operation not in _LINEAR or bent.get(operation, False):
         raise CompilationError(f"{function.name()}: is not linear in its directions")
     if operation == ca.OP_IF_ELSE_ZERO:
         names.append("none" if wide[1] else "0.0")
     return _LINEAR[operation].format(*names)
-
-
-def build(source: str, *, only_cached: bool = False) -> Path | None:
-    """Compile a source, or take the library compiled from the same source before.
-
-    Args:
-        only_cached: do not compile; ``None`` where there is no library yet.
-
-    Raises:
-        CompilationError: no compiler, or it failed.
-    """
-    cc, (native, features) = compiler(), processor()
-    key = hashlib.sha256("\0".join((source, *FLAGS, *native, features, cc or "")).encode()).hexdigest()[:24]
-    target = cache_directory() / f"{key}.so"
-    if target.exists():
-        return target
-    if only_cached:
-        return None
-    if cc is None:
-        raise CompilationError('no C compiler was found: install one, set CC, or use compile = "auto"')
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-            unit = Path(folder) / "stage.c"
-            unit.write_text(source)
-            built = Path(folder) / target.name
-            done = subprocess.run(
-                [cc, *FLAGS, *native, str(unit), "-o", str(built), "-lm"], capture_output=True, text=True, check=False
-            )
-            if done.returncode != 0:
-                raise CompilationError(f"{cc} failed: {done.stderr.strip()[:500]}")
-            built.replace(target)
-    except OSError as cause:
-        raise CompilationError(f"the C code could not be compiled in {target.parent}: {cause}") from cause
-    return target
-
-
-def load(library: Path) -> ctypes.CDLL:
-    """Load a copy of a library of one's own: its work arrays are static, and two kernels of one model must not share them."""
-    with tempfile.TemporaryDirectory() as folder:
-        own = Path(folder) / library.name
-        shutil.copyfile(library, own)
-        return ctypes.CDLL(str(own))
-
-
-class CompiledLoop:
-    """The stepping loop of a compiled library."""
-
-    def __init__(self, library: Path) -> None:
-        self._advance = load(library).pgexcite_advance
-        self._advance.restype = ctypes.c_int
-        pointer = ctypes.c_void_p
-        self._advance.argtypes = [ctypes.c_int, ctypes.c_double, ctypes.c_int, pointer, *([pointer] * 9)]
-
-    def advance(self, rule: int, h: float, n: int, startup: int, arrays: Sequence[Array]) -> tuple[int, int]:
-        """Take up to ``n`` steps; returns how many were taken and the startup steps left.
-
-        Args:
-            arrays: ``x, z, d, u, p`` (renewed in place) and the rows of ``x, z, d, y`` to record into, contiguous float64.
-        """
-        left = ctypes.c_int(startup)
-        done = self._advance(rule, h, n, ctypes.addressof(left), *(array.ctypes.data for array in arrays))
-        return int(done), int(left.value)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.bound import bind
-from pgexcite.core.codegen import CompilationError, build, compiler, load, loop, write_functions
+from pgexcite.core.codegen import define, loop, write_functions
+from pgexcite.core.compiling import library
 from pgexcite.core.settings import Compile
 
 Array = NDArray[np.float64]
@@ -56,15 +57,6 @@ class Mapped:
 
 
 def _compiled(function: ca.Function, choice: Compile) -> ctypes.CDLL | None:
-    if choice == "never" or (choice in ("auto", "wait") and compiler() is None):
-        return None
-    sizes = {"N_IN": function.numel_in(0), "N_OUT": function.numel_out(0), "FUNCTION": function.name()}
-    sizes |= {key.upper(): max(1, getattr(function, key)()) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}
-    defines = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
-    try:
-        library = build("\n".join([write_functions([function]), defines, loop("mapped.c")]))
-    except CompilationError:
-        if choice == "always":
-            raise
-        return None
-    return None if library is None else load(library)
+    sizes = {"n_in": function.numel_in(0), "n_out": function.numel_out(0), "function": function.name()}
+    sizes |= {key: max(1, getattr(function, key)()) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w")}
+    return library(lambda: "\n".join([write_functions([function]), define(sizes), loop("mapped.c")]), choice)

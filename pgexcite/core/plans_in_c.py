@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from pathlib import Path
 from string import Template
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.codegen import array, define, generate, load, loop
+from pgexcite.core.codegen import array, define, generate, loop
 from pgexcite.core.condensed import Condensed
 from pgexcite.core.horizons import Horizons
 from pgexcite.core.iteration import ShootingOptions
 from pgexcite.core.model import State
 from pgexcite.core.mpc import Solution, Status
 from pgexcite.core.prediction import Predictor
-from pgexcite.core.written import planning, program
+from pgexcite.core.written import Predictions, planning, program
 
 Array = NDArray[np.float64]
 
@@ -39,8 +38,9 @@ def plans_in_c(
     same = not condensed.rows and not options.candidates and predictor.rule != "trapezoidal"
     if not (predictor.kernel.compiled and same and (condensed.problem.R > 0).all()):
         return None
-    library = _compiled(predictor, condensed, horizons, options)
-    return None if library is None else PlansInC(load(library), predictor, condensed)
+    of_plans = planning(predictor, condensed, horizons, options, exported=False)
+    library = predictor.kernel.library(lambda: _source(condensed, of_plans), of_plans.functions)
+    return None if library is None else PlansInC(library, predictor, condensed)
 
 
 class PlansInC:
@@ -119,21 +119,17 @@ class PlansInC:
         self._library.pgexcite_remember(1, there, *(_address(a) for a in self._kept))
 
 
-def _compiled(predictor: Predictor, condensed: Condensed, horizons: Horizons, options: ShootingOptions) -> Path | None:
-    """The library, where it is to be waited for."""
-    of_plans, (of_program, numbers) = (
-        planning(predictor, condensed, horizons, options, exported=False),
-        program(condensed),
-    )
+def _source(condensed: Condensed, of_plans: Predictions) -> str:
+    of_program, numbers = program(condensed)
     constants = {**of_program, **of_plans.constants, "delayed": int(condensed.problem.delayed)}
     words = {"name": _NAME.lower(), "NAME": _NAME}
-    source = [
+    parts = [
         generate(of_plans.functions, constants, LOOPS, of_plans.along),
         define({f"{_NAME}_{status.name}": k for k, status in enumerate(_STATUS)}),
         *(array(name, values.ravel()) for name, values in {**numbers, **of_plans.arrays}.items()),
         *(Template(loop(name)).substitute(words) for name in _TEXTS),
     ]
-    return predictor.kernel.library("\n".join(source), of_plans.functions)
+    return "\n".join(parts)
 
 
 def _address(values: NDArray[np.float64]) -> ctypes.c_void_p:

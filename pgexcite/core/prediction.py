@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pgexcite.core.codegen import generate, load
+from pgexcite.core.codegen import generate
 from pgexcite.core.model import State
 from pgexcite.core.rollout import Horizon, Rollout, Transition
 from pgexcite.core.sensing import Sensing
@@ -70,9 +70,8 @@ class Predictor:
             return None
         written, loops = self.sensitivities, ["step.c", "rollout.c", "chain.c"]
         called = [*self.kernel.stepping(), *written.functions()]
-        source = generate(called, self.constants(transitions=self.transitions), loops, written.along())
-        library = self.kernel.library(source, called)
-        return None if library is None else load(library)
+        constants = self.constants(transitions=self.transitions)
+        return self.kernel.library(lambda: generate(called, constants, loops, written.along()), called)
 
     def make_ready(self) -> None:
         """Compile now what would be compiled for the first prediction, which may have a deadline."""

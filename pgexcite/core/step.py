@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import ctypes
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -15,7 +15,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pgexcite.core.bound import bind
-from pgexcite.core.codegen import CompilationError, CompiledLoop, build, compiler, generate
+from pgexcite.core.codegen import generate
+from pgexcite.core.compiling import CompiledLoop
+from pgexcite.core.compiling import library as compiled
 from pgexcite.core.model import Model, State
 from pgexcite.core.pivoting import solved
 from pgexcite.core.settings import Compile, Rule
@@ -138,27 +140,20 @@ class Kernel:
         return [f.prepare, f.newton, f.check, f.update]
 
     def _compile(self) -> CompiledLoop | None:
-        choice = self._choice
-        if choice == "never" or self.functions.newton is None or (choice in ("auto", "wait") and compiler() is None):
+        if self.functions.newton is None:
             return None
         called = [*self.stepping(), self.functions.land]
-        source = generate(called, self.constants(), ["step.c", "advance.c"])
-        try:
-            library = self.library(source, called)
-        except CompilationError:
-            if choice == "always":
-                raise
-            return None
+        library = self.library(lambda: generate(called, self.constants(), ["step.c", "advance.c"]), called)
         return None if library is None else CompiledLoop(library)
 
-    def library(self, source: str, called: Sequence[ca.Function]) -> Path | None:
-        """The library of a source with these functions; ``None`` where ``compile = "auto"`` does not wait for it.
+    def library(self, write: Callable[[], str], called: Sequence[ca.Function]) -> ctypes.CDLL | None:
+        """The library of a source with these functions, a copy of one's own, where ``compile`` is for it.
 
         Raises:
-            CompilationError: no compiler, or it failed.
+            CompilationError: it cannot be had, and ``compile = "always"``.
         """
         large = sum(function.n_instructions() for function in called) > COMPILED_BY_DEFAULT
-        return build(source, only_cached=large and self._choice == "auto")
+        return compiled(write, self._choice, only_cached=large and self._choice == "auto")
 
     # The public faces: pure functions of frozen states.
 

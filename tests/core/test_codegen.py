@@ -1,160 +1,19 @@
-"""Generated C: optional, cached by content, and refused loudly only where it was asked for."""
+"""C as it is written: the same for the same model, lane for lane the functions themselves, refused where it would not be."""
 
 from __future__ import annotations
 
-import shutil
-import stat
+import ctypes
+import subprocess
 
+import casadi as ca
 import numpy as np
 import pytest
-from plants import kobbelv, regulated
+from plants import regulated
 
-from pgexcite.core import codegen
-from pgexcite.core.codegen import CompilationError, build, cache_directory, compiler, generate
-from pgexcite.core.events import Fault
+from pgexcite.core.codegen import CompilationError, define, generate, loop, number, write_along
+from pgexcite.core.compiling import compiler
 from pgexcite.core.initialise import initialise
-from pgexcite.core.settings import Settings
-from pgexcite.core.simulate import Simulation
 from pgexcite.core.step import Kernel
-from pgexcite.plugins.controllers.mpc import MPC
-from pgexcite.plugins.machines.salient_pole import SalientPole
-
-FAULT = Fault(type="fault", t=0.05, bus="HV", R=0.02, duration=0.1).changes()
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    """An empty cache of this test's own."""
-    monkeypatch.setenv("PGEXCITE_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
-def simulation(compile, system=None):
-    return Simulation(system or kobbelv(), Settings(0.2, 0.005, compile=compile), FAULT)
-
-
-def libraries(cache):
-    return sorted(path.name for path in cache.glob("*.so")) if cache.exists() else []
-
-
-def without_compiler(monkeypatch):
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setenv("PATH", "/nonexistent")
-
-
-def with_broken_compiler(monkeypatch, tmp_path):
-    broken = tmp_path / "broken-cc"
-    broken.write_text("#!/bin/sh\necho 'no such instruction' >&2\nexit 1\n")
-    broken.chmod(broken.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv("CC", str(broken))
-
-
-def test_without_a_compiler_it_is_slower_never_broken(monkeypatch, cache):
-    compiled = simulation("always")
-    compiled.run()
-    without_compiler(monkeypatch)
-    assert compiler() is None
-    assert not simulation("wait").kernel.compiled
-    plain = simulation("auto")
-    assert not plain.kernel.compiled
-    assert plain.run().ending.value == "completed"
-    assert np.array_equal(plain.state.x, compiled.state.x)
-
-
-def test_auto_leaves_a_large_model_to_the_virtual_machine_and_wait_does_not(monkeypatch, cache):
-    monkeypatch.setattr("pgexcite.core.step.COMPILED_BY_DEFAULT", 10)
-    assert not simulation("auto").kernel.compiled
-    assert libraries(cache) == []
-    assert simulation("wait").kernel.compiled
-    assert simulation("auto").kernel.compiled  # it is there now
-
-
-def test_auto_waits_for_no_large_prediction_either(monkeypatch, cache):
-    """The plant's library is there from another run; that is no reason to wait for the plans'."""
-    controlled = {"mpc": MPC(unit="G2")}
-    simulation("wait")
-    monkeypatch.setattr("pgexcite.core.step.COMPILED_BY_DEFAULT", 10)
-    run = Simulation(kobbelv(), Settings(0.2, 0.005, compile="auto"), FAULT, controlled)
-    assert run.kernel.compiled
-    run.run()
-    assert len(libraries(cache)) == 1
-    Simulation(kobbelv(), Settings(0.2, 0.005, compile="wait"), FAULT, controlled).run()
-    assert len(libraries(cache)) > 1
-
-
-def test_without_a_compiler_always_is_an_error_that_says_what_to_do(monkeypatch):
-    without_compiler(monkeypatch)
-    with pytest.raises(CompilationError, match='install one, set CC, or use compile = "auto"'):
-        simulation("always")
-
-
-def test_a_compiler_that_fails(monkeypatch, tmp_path, cache):
-    with_broken_compiler(monkeypatch, tmp_path)
-    assert not simulation("auto").kernel.compiled
-    with pytest.raises(CompilationError, match="broken-cc failed: no such instruction"):
-        simulation("always")
-    assert list(cache.iterdir()) == []  # nothing half-built is left behind
-
-
-def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    monkeypatch.setenv("PGEXCITE_CACHE", str(tmp_path / "file"))
-    assert not simulation("auto").kernel.compiled
-    with pytest.raises(CompilationError, match="the C code could not be compiled in"):
-        simulation("always")
-
-
-def test_never_compiles_nothing(cache):
-    assert not simulation("never").kernel.compiled
-    assert libraries(cache) == []
-
-
-def test_a_library_is_compiled_once_for_any_parameters(monkeypatch, cache):
-    """Parameters are symbols: another reactance or gain finds the same library, another component another one."""
-    simulation("always")
-    assert len(libraries(cache)) == 1
-    calls = []
-    real = codegen.subprocess.run
-    monkeypatch.setattr(codegen.subprocess, "run", lambda *a, **k: calls.append(a) or real(*a, **k))
-    again = simulation("always", kobbelv(machine=SalientPole(H=4.0)))
-    assert again.kernel.compiled
-    assert calls == []
-    simulation("always", regulated())
-    assert len(calls) == 1
-    assert len(libraries(cache)) == 2
-
-
-def test_another_compiler_is_another_library(monkeypatch, tmp_path, cache):
-    simulation("always")
-    other = tmp_path / "other-cc"
-    other.write_text(f'#!/bin/sh\nexec {shutil.which("cc") or shutil.which("gcc")} "$@"\n')
-    other.chmod(other.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv("CC", str(other))
-    simulation("always")
-    assert len(libraries(cache)) == 2
-
-
-def test_only_cached_compiles_nothing(cache):
-    source = "int pgexcite_advance(void) { return 0; }"
-    assert build(source, only_cached=True) is None
-    path = build(source)
-    assert path is not None
-    assert build(source, only_cached=True) == path
-    assert path.parent == cache_directory()
-
-
-def test_two_kernels_of_one_model_share_no_work_arrays():
-    initial = initialise(kobbelv())
-    kernels = [Kernel(initial.model, initial.state, initial.p, "always") for _ in range(2)]
-    other = initial.p.copy()
-    other[initial.model.position("p", "unit.G2.machine.H")] = 1.0
-    faulted = initial.p.copy()
-    faulted[initial.model.position("p", "bus.HV.fault_status")] = 1.0
-    alone = kernels[0].advance(initial.state, faulted, "tr_bdf2", 0.005, 10)
-    kernels[1].advance(initial.state, other, "trapezoidal", 0.01, 3)
-    interleaved = kernels[0].advance(initial.state, faulted, "tr_bdf2", 0.005, 10)
-    assert np.array_equal(alone.x, interleaved.x)
-    assert np.array_equal(alone.y, interleaved.y)
 
 
 def test_the_source_is_the_same_for_the_same_model():
@@ -166,13 +25,74 @@ def test_the_source_is_the_same_for_the_same_model():
     assert len(sources) == 1
 
 
-def test_a_step_that_fails_in_c_is_rescued_as_in_the_virtual_machine(monkeypatch):
-    """With two iterations many steps give up; shorter inner steps take over, and both ways end at the same point."""
-    monkeypatch.setattr("pgexcite.core.step.MAX_ITERATIONS", 2)
-    ends = []
-    for compile in ("never", "always"):
-        sim = Simulation(kobbelv(), Settings(0.5, 0.02, compile=compile), FAULT)
-        assert sim.run().ending.value == "completed"
-        assert any(entry.kind == "solver" for entry in sim.trace().log)
-        ends.append(sim.state.x)
-    assert np.abs(ends[0] - ends[1]).max() < 1e-9
+FACTORS, DIRECTION, COMMAND = ca.SX.sym("factors", 3), ca.SX.sym("s", 2), ca.SX.sym("s_c")
+ALONG = ca.Function(
+    "along",
+    [FACTORS, DIRECTION, COMMAND],
+    [
+        ca.vertcat(
+            FACTORS[0] * DIRECTION[0] - DIRECTION[1] / 3.7,
+            ca.if_else(FACTORS[1], -2 * DIRECTION[0] + FACTORS[2] * COMMAND, 0),
+            DIRECTION[1],
+            0.0,
+        )
+    ],
+)
+DRIVER = """
+static lanes from1[N_BLOCKS][2], from2[N_BLOCKS][1], to[N_BLOCKS][4];
+#define AT(of, k, i) (((double *)of[(k) / LANES])[(i) * LANES + (k) % LANES])
+void all(const double *factors, const double *directions, double *derivatives) {
+    int k, i;
+    for (k = 0; k < N_COLUMNS; k++) {
+        for (i = 0; i < 2; i++) AT(from1, k, i) = directions[k * 3 + i];
+        AT(from2, k, 0) = directions[k * 3 + 2];
+    }
+    for (k = 0; k < N_BLOCKS; k++) along(factors, from1[k], from2[k], to[k]);
+    for (k = 0; k < N_COLUMNS; k++)
+        for (i = 0; i < 4; i++) derivatives[k * 4 + i] = AT(to, k, i);
+}
+"""
+
+
+@pytest.mark.compiler
+@pytest.mark.parametrize(
+    "flags", [["-DLANES=1"], ["-DLANES=1", "-U__GNUC__"], ["-DLANES=2"], ["-DLANES=4"], ["-DLANES=8"], []]
+)
+@pytest.mark.parametrize("columns", [1, 3, 9])
+def test_lane_for_lane_it_is_the_function(tmp_path, columns, flags):
+    """Vectors wider than the processor's are taken apart by the compiler."""
+    source = define({"n_columns": columns}) + loop("lanes.c") + write_along(ALONG) + DRIVER
+    (tmp_path / "along.c").write_text(source)
+    strict = ["-std=c99", "-O1", "-ffp-contract=off", "-Wall", "-Wextra", "-Wno-psabi", "-Werror", "-fPIC", "-shared"]
+    command = [compiler(), *strict, *flags, "along.c", "-o", "along.so"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    rng = np.random.default_rng(columns)
+    for switch in (1.0, 0.0):
+        factors, directions = np.array([0.3, switch, 1.9]), rng.normal(size=(columns, 3))
+        found = np.empty((columns, 4))
+        library = ctypes.CDLL(str(tmp_path / "along.so"))
+        library.all(*(ctypes.c_void_p(a.ctypes.data) for a in (factors, directions, found)))
+        expected = [np.array(ALONG(factors, s[:2], s[2])).ravel() for s in directions]
+        assert np.array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        DIRECTION[0] * DIRECTION[1],
+        FACTORS[0] / DIRECTION[0],
+        ca.sin(DIRECTION[0]),
+        ca.if_else(DIRECTION[0], FACTORS[0], 0),
+        ca.if_else(DIRECTION[0], DIRECTION[1], 0),
+    ],
+)
+def test_what_is_not_linear_in_its_directions_is_refused(value):
+    with pytest.raises(CompilationError, match="bent: is not linear in its directions"):
+        write_along(ca.Function("bent", [FACTORS, DIRECTION], [value]))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.1, "0.1"), (3, "3"), (np.inf, "INFINITY"), (-np.inf, "-INFINITY"), (np.nan, "NAN")]
+)
+def test_a_number_is_written_to_the_last_bit(value, text):
+    assert number(value) == text

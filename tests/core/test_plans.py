@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plants import REGULATED, kobbelv, regulated, two_units
 
-from pgexcite.core.codegen import compiler
+from pgexcite.core.compiling import compiler
 from pgexcite.core.events import Fault
 from pgexcite.core.plans_in_c import PlansInC
 from pgexcite.core.plans_in_python import PlansInPython

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plants import kobbelv, regulated
 
-from pgexcite.core.codegen import compiler
+from pgexcite.core.compiling import compiler
 from pgexcite.core.events import Fault
 from pgexcite.core.prediction import Predictor
 from pgexcite.core.rollout import Horizon

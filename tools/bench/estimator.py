@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import UnscentedKalmanFilter
 
-from pgexcite.core import codegen
+from pgexcite.core import compiling
 from pgexcite.core.config import Scenario, load
 from pgexcite.core.export import export_c
 from pgexcite.core.simulate import Simulation
@@ -77,7 +77,7 @@ class Controller:
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         export_c(scenario, folder)
-        compiler = codegen.compiler()
+        compiler = compiling.compiler()
         assert compiler is not None
         command = [compiler, "-std=c99", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "mpc.c", "-o", "mpc.so", "-lm"]
         subprocess.run(command, cwd=folder, check=True)

@@ -37,7 +37,7 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import minimize
 
-from pgexcite.core import codegen
+from pgexcite.core import compiling
 from pgexcite.core.config import load
 from pgexcite.core.controller import Sample
 from pgexcite.core.export import export_c
@@ -171,7 +171,7 @@ def exported(N: int, t_end: float, folder: Path, passes: int, step: float = 0.0,
     """The exported C on its own replay, compiled for this processor; so many programs after a jump."""
     options = f"{{step={step}, jump_iterations={programs}}}"
     directory = export_c(scenario(N, t_end, options=options), folder / f"c{N}-{step}-{programs}").directory
-    cc, (native, _) = codegen.compiler(), codegen.processor()
+    cc, (native, _) = compiling.compiler(), compiling.processor()
     assert cc is not None
     command = [cc, "-std=c99", "-O2", *native, "-ffp-contract=off", "-fPIC", "-shared", "mpc.c", "-o", "mpc.so", "-lm"]
     subprocess.run(command, cwd=directory, check=True)

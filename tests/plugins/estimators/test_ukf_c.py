@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pgexcite.core import codegen
+from pgexcite.core.compiling import compiler
 from pgexcite.core.config import load
 from pgexcite.plugins.estimators.ukf import UKF
 
@@ -85,7 +86,7 @@ class Filters:
             "-Wpedantic",
             "-Wno-unused-function",
         ]
-        command = [codegen.compiler(), *strict, "-fPIC", "-shared", "filter.c", "-o", "filter.so", "-lm"]
+        command = [compiler(), *strict, "-fPIC", "-shared", "filter.c", "-o", "filter.so", "-lm"]
         subprocess.run(command, cwd=folder, check=True)
         library = ctypes.CDLL(str(folder / "filter.so"))
         library.observe.argtypes = [ctypes.c_void_p, ctypes.c_double, *([ctypes.c_void_p] * 3)]
