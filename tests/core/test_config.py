@@ -181,9 +181,13 @@ WRONG = [
     (
         lambda d: d["infinite_bus"]["grid"].pop("V"),
         "bus.A",
-        "without V: infinite_bus.grid; with all of P, Q and V: none",
+        "as many of these as of those; give V to infinite_bus.grid, or Q beside P and V to a unit",
     ),
-    (lambda d: d["unit"]["G1"].update(Q=3.0), "bus.A", "without V: none; with all of P, Q and V: unit.G1"),
+    (
+        lambda d: d["unit"]["G1"].update(Q=3.0),
+        "bus.A",
+        "with all of P, Q and V: unit.G1; there must be as many of these as of those; leave Q or V out at unit.G1",
+    ),
     (lambda d: d["unit"]["G1"].pop("P"), "unit.G1.P", "is required of a unit that is no slack"),
     (lambda d: d["unit"]["G1"].pop("V"), "unit.G1.V", "V (pu) or Q (Mvar) is required"),
     (lambda d: d["unit"]["G1"].update(slack=True), "unit.G1.P", "a slack's power follows from the power flow"),

@@ -165,10 +165,12 @@ def test_what_it_does_not_do_is_refused(setting, expected, tmp_path):
 
 
 def test_which_controller(tmp_path):
-    with pytest.raises(ConfigError, match="there is no controller 'mpk'"):
+    with pytest.raises(ConfigError, match=r"there is no such controller \(got 'mpk'\); did you mean 'mpc'"):
         export_c(load(NMPC), tmp_path / "out", "mpk")
-    with pytest.raises(ConfigError, match="which of the controllers"):
+    with pytest.raises(ConfigError, match="there is none to export"):
         export_c(load(CONFIGS / "smib" / "fault_st1a.toml"), tmp_path / "out")
+    with pytest.raises(ConfigError, match=r"there are several: \w+, .*; choose one with --controller"):
+        export_c(load(CONFIGS / "two_area" / "fault_equivalent.toml"), tmp_path / "out")
 
 
 def test_other_files_are_left_alone(tmp_path):

@@ -54,10 +54,15 @@ def check_islands(system: System, collect: Collector) -> None:
         free = [device.path for device in there if device.schedule.angle is not None and device.schedule.V is None]
         full = [device.path for device in there if _has_all(device)]
         if len(free) != len(full):
+            remedy = (
+                f"give V to {_listed(free)}, or Q beside P and V to a unit for each"
+                if len(free) > len(full)
+                else f"leave Q or V out at {_listed(full)}, or V at an infinite bus for each"
+            )
             collect.add(
                 where,
                 f"without V: {_listed(free)}; with all of P, Q and V: {_listed(full)}; there must be as many of these as of those",
-                hint="leave V out at one infinite bus for each unit that is given P, Q and V",
+                hint=remedy,
             )
 
 

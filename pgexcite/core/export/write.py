@@ -16,6 +16,7 @@ from pgexcite.core.export import shared, text
 from pgexcite.core.export.parts import Exportable, Parts
 from pgexcite.core.export.recorder import Recorder
 from pgexcite.core.ladder import Ladder
+from pgexcite.core.registry import nearest
 from pgexcite.core.shooting import Shooting
 from pgexcite.core.written import program
 
@@ -82,8 +83,13 @@ def _chosen(scenario: Scenario, controller: str) -> str:
         return controller
     if not controller and len(names) == 1:
         return names[0]
-    what = f"there is no controller {controller!r}" if controller else "which of the controllers is to be exported?"
-    raise ConfigError([Problem("controller", what, hint=f"there are: {', '.join(names) or 'none'}")])
+    if controller:
+        problem = Problem("controller", "there is no such controller", controller, nearest(controller, names))
+    elif names:
+        problem = Problem("controller", f"there are several: {', '.join(names)}", hint="choose one with --controller")
+    else:
+        problem = Problem("controller", "there is none to export", hint="add a [controller.NAME] table")
+    raise ConfigError([problem])
 
 
 def _prefix(name: str, parts: Parts) -> str:

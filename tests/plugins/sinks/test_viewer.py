@@ -2,10 +2,12 @@
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +42,7 @@ def screenshots(recording: Path, directory: Path):
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(directory), "HOME": str(directory)}
     with (
         (directory / "viewer.log").open("w") as log,
-        subprocess.Popen(command, stdout=log, stderr=log, env=environment) as process,
+        subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True) as process,
     ):
         try:
             end = time.monotonic() + TIMEOUT
@@ -52,7 +54,9 @@ def screenshots(recording: Path, directory: Path):
                 if picture.exists():
                     yield pixels(picture)
         finally:
-            process.terminate()
+            # "rerun" is a script that starts the viewer: ended alone, it would leave that behind.
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGTERM)
 
 
 def pixels(picture: Path):
