@@ -61,6 +61,7 @@ class PlansInPython:
 
     def plan(self, state: State, t: float, p: Array, u_last: Array) -> Solution:
         """The plan from this state on."""
+        self._from = None
         if self.problem.delayed:
             later = a_sample_later(self.predictor, self.horizons, state, t, u_last, p)
             if later is None:
@@ -112,6 +113,7 @@ class PlansInPython:
 
     def recall(self, memory: Mapping[str, Array]) -> None:
         """Take up where ``memory`` left off."""
+        self._from = None
         self._plan = memory.get("plan")
         prepared = those_under("prepared", memory)
         self._ready(_Prepared(**prepared) if prepared else None)

@@ -143,7 +143,8 @@ def _without_division(derivative: ca.SX, direction: ca.SX) -> tuple[ca.SX, ca.SX
     free, directions = ca.symvar(derivative), hashes(direction)
     tape = ca.Function("tape", free, [derivative], _OPTIONS)
     values: dict[int, tuple[ca.SX, bool]] = {}
-    inverse: dict[int, tuple[ca.SX, ca.SX]] = {}
+    # By the divisor's address, so the divisor is kept as well.
+    inverse: dict[int, tuple[ca.SX, ca.SX, ca.SX]] = {}
     written = ca.SX.zeros(derivative.numel())
     for k in range(tape.n_instructions()):
         operation, to, of = tape.instruction_id(k), tape.instruction_output(k), tape.instruction_input(k)
@@ -157,13 +158,14 @@ def _without_division(derivative: ca.SX, direction: ca.SX) -> tuple[ca.SX, ca.SX
             operands, moves = [values[i][0] for i in of], [values[i][1] for i in of]
             if operation == ca.OP_DIV and moves[0]:
                 # CasADi would make a quotient of a product with an expression that is an inverse.
-                symbol, _ = inverse.setdefault(operands[1].element_hash(), (ca.SX.sym("inverse"), 1 / operands[1]))
-                result = operands[0] * symbol
+                divisor = operands[1]
+                made = ca.SX.sym("inverse"), 1 / divisor, divisor
+                result = operands[0] * inverse.setdefault(divisor.element_hash(), made)[0]
             else:
                 result = apply(operation, operands)
             values[to[0]] = result, any(moves)
     nothing = ca.SX(0, 1)
-    symbols, inverses = (ca.vertcat(nothing, *(pair[k] for pair in inverse.values())) for k in (0, 1))
+    symbols, inverses = (ca.vertcat(nothing, *(each[k] for each in inverse.values())) for k in (0, 1))
     return written, symbols, inverses
 
 

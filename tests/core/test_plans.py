@@ -8,6 +8,7 @@ from plants import REGULATED, kobbelv, regulated, two_units
 
 from pgexcite.core.compiling import compiler
 from pgexcite.core.events import Fault
+from pgexcite.core.mpc import Status
 from pgexcite.core.plans_in_c import PlansInC
 from pgexcite.core.plans_in_python import PlansInPython
 from pgexcite.core.settings import Settings
@@ -164,6 +165,30 @@ def test_without_a_state_nothing_is_prepared():
     for each in (plans.acting, plans.watching):
         assert "prepared:plan" in each.memory()
         each.lost()
+        each.prepare(np.array([2.0]))
+        assert "prepared:plan" not in each.memory()
+
+
+def test_after_a_sample_that_could_not_be_planned_nothing_is_prepared_from_the_one_before():
+    sim = simulation("computing delay")
+    plans = watched(sim)
+    sim.run(until=0.1)
+    beyond = sim.state.with_(x=1e9 * sim.state.x)
+    for each in (plans.acting, plans.watching):
+        assert each.plan(sim.state, 0.1, sim.p, np.array([2.0])).status.usable
+        assert each.plan(beyond, 0.15, sim.p, np.array([2.0])).status is Status.PREDICTION_FAILED
+        each.prepare(np.array([2.0]))
+        assert "prepared:plan" not in each.memory()
+
+
+def test_what_is_recalled_is_not_prepared_from_a_sample_before():
+    sim = simulation("one move")
+    plans = watched(sim)
+    sim.run(until=0.1)
+    for each in (plans.acting, plans.watching):
+        kept = each.memory()
+        assert each.plan(sim.state, 0.1, sim.p, np.array([2.0])).status.usable
+        each.recall({"plan": kept["plan"]})
         each.prepare(np.array([2.0]))
         assert "prepared:plan" not in each.memory()
 
