@@ -211,7 +211,7 @@ OTHER_SUPPLY = {
     "stabilisers": ("fault_thyristor_pss", INDEPENDENT, None),
     "stabilisers with wide limits, from the terminals": ("fault_thyristor_pss", WIDE, 2.56),
     "nmpc": ("fault_nmpc", FROM_THE_TERMINALS, 2.67),
-    "nmpc, one move": ("fault_nmpc", (*FROM_THE_TERMINALS, *ONE_MOVE), 2.85),
+    "nmpc, one move": ("fault_nmpc", (*FROM_THE_TERMINALS, *ONE_MOVE), 3.45),
     "secondary": ("fault_linear_secondary", INDEPENDENT, None),
     "secondary, one move": ("fault_linear_secondary", (*INDEPENDENT, *ONE_MOVE), 4.44),
     "linear": ("fault_linear", FROM_THE_TERMINALS, 6.79),
