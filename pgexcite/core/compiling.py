@@ -5,13 +5,16 @@ No compiler means slower, never broken: the caller then keeps to CasADi's virtua
 
 from __future__ import annotations
 
+import _ctypes
 import ctypes
 import hashlib
 import os
 import platform
 import shutil
 import subprocess
+import sys
 import tempfile
+import weakref
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -130,9 +133,13 @@ def load(library: Path) -> ctypes.CDLL:
         with tempfile.TemporaryDirectory() as folder:
             own = Path(folder) / library.name
             shutil.copyfile(library, own)
-            return ctypes.CDLL(str(own))
+            loaded = ctypes.CDLL(str(own))
     except OSError as cause:
         raise CompilationError(f"the library {library} could not be loaded: {cause}") from cause
+    if sys.platform != "win32":
+        # A study makes thousands of simulations, and a process may map only so many files. Its functions keep a library alive.
+        weakref.finalize(loaded, _ctypes.dlclose, loaded._handle).atexit = False
+    return loaded
 
 
 class CompiledLoop:

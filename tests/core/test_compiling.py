@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 import stat
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,6 +118,27 @@ def test_without_a_home_there_is_no_cache(monkeypatch):
     assert not simulation("auto").kernel.compiled
     with pytest.raises(CompilationError, match="set PGEXCITE_CACHE: Could not determine home directory"):
         simulation("always")
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="the system does not tell what a process has mapped")
+def test_libraries_are_let_go_with_the_runs_that_used_them(cache):
+    def mapped():
+        return sum(
+            name in line for line in Path("/proc/self/maps").read_text().splitlines() for name in libraries(cache)
+        )
+
+    sim = Simulation(kobbelv(), Settings(0.1, 0.005, compile="always"), FAULT, {"mpc": MPC(unit="G2")})
+    sim.run()
+    few = mapped()
+    assert few > 0
+    for _ in range(3):
+        sim.restart()
+        sim.run()
+    gc.collect()
+    assert mapped() <= few
+    del sim
+    gc.collect()
+    assert mapped() == 0
 
 
 def test_a_library_that_must_not_be_loaded(monkeypatch):
