@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pgexcite.core.controller import Action
 from pgexcite.core.model import Model, State
 from pgexcite.core.result import ControllerStatistics
-from pgexcite.core.trace import LogEntry, Trace
+from pgexcite.core.trace import LogEntry, Trace, reference_of
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ class History:
             for key in {key: None for row in of.diagnostics for key in row}:
                 path = f"controller.{name}.{key}"
                 columns[path] = _held(t, of.t, [row.get(key, np.nan) for row in of.diagnostics])
-                units[path] = "ms" if key.endswith("_ms") else ""
+                units[path] = "ms" if key.endswith("_ms") else "pu" if key.startswith(reference_of("")) else ""
         return Trace(t, columns, units, tuple(sorted(self._log, key=lambda entry: entry.t)))
 
     def statistics(self) -> dict[str, ControllerStatistics]:

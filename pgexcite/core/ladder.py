@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from pgexcite.core.controller import Action, Sample
 from pgexcite.core.memory import as_arrays, those_under, under
 from pgexcite.core.mpc import ControlProblem, Solution, Solver, Status
+from pgexcite.core.trace import reference_of
 
 Array = NDArray[np.float64]
 
@@ -135,9 +136,16 @@ class Ladder:
             "solve_ms": elapsed,
             **{f"{phase}_ms": value for phase, value in solution.times_ms.items()},
             **solution.diagnostics,
+            **self._aims(sample.t),
         }
         action = self._active(why, notes) if sample.active else self._standby(why, notes)
         return Action(action.commands, diagnostics, passed, bool(why) and sample.active, action.release, tuple(notes))
+
+    def _aims(self, t: float) -> dict[str, float]:
+        """References in force of the units' terminal voltages, pu: what a run is judged by while this controller is in charge."""
+        references = zip(self.problem.voltages, self.problem.reference_at(t), strict=True)
+        of_units = ((path.removeprefix("unit.").removesuffix(".v_t"), path, value) for path, value in references)
+        return {reference_of(unit): float(value) for unit, path, value in of_units if path == f"unit.{unit}.v_t"}
 
     def _solve(self, sample: Sample, in_force: Array) -> Solution:
         """A solution, whatever happens: arithmetic that fails inside a solver is a failed plan, not the end of the run."""

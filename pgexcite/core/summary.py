@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgexcite.core.result import ControllerStatistics, RunResult
-from pgexcite.core.trace import Array, Ending, Trace
+from pgexcite.core.trace import Array, Ending, Trace, reference_of
 
 SETTLING_BAND = 0.01
 """Half-width of the band a settled terminal voltage stays in, as a part of its final value."""
@@ -79,6 +79,10 @@ def voltage_target(trace: Trace, unit: str) -> Array:
     if reference is not None:
         jumps = np.where(np.diff(trace.t) == 0, np.diff(reference), 0.0)
         target[1:] += np.cumsum(jumps)
+    for path, aim in trace.columns.items():
+        if path.startswith("controller.") and path.endswith(f".{reference_of(unit)}"):
+            in_charge = trace[f"{path.rpartition('.')[0]}.active"] > 0
+            target = np.where(in_charge & np.isfinite(aim), aim, target)
     return target
 
 

@@ -59,6 +59,11 @@ class LogEntry:
     text: str
 
 
+def reference_of(unit: str) -> str:
+    """Name under which a controller records the reference of a unit's terminal voltage: ``controller.mpc.V_ref_G2``, pu."""
+    return f"V_ref_{unit}"
+
+
 @dataclass(frozen=True)
 class Trace:
     """Samples of every signal over a run.

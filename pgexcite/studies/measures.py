@@ -15,6 +15,9 @@ _SMALLEST_SWING = math.radians(0.1)
 _FADED = 0.1
 """A swing below this part of the first one is no longer measured: the ratio of two small numbers says little."""
 
+_MOVED = 1e-6
+"""A target that changes by less has not been moved, pu."""
+
 
 def swing_figures(trace: Trace, unit: str) -> dict[str, float | None]:
     """All figures of this module for a unit, by name; ``None`` where one cannot be had.
@@ -48,11 +51,13 @@ def first_swing_max(trace: Trace, unit: str) -> float | None:
 def recovery_time(trace: Trace, unit: str, band: float) -> float | None:
     """Time from the last event until the terminal voltage stays within ``band`` (0.05: 5 %) of its target for good, s.
 
-    The target is the initial voltage, moved by set-point events. ``None`` when the voltage is outside at the end.
+    The target is that of ``voltage_target``; where it changes without an event (a controller's own), that counts as
+    one. ``None`` when the voltage is outside at the end.
     """
     events = event_times(trace)
-    begin = after(trace, events[-1]) if events else 0
     target = voltage_target(trace, unit)
+    moved = np.flatnonzero(np.abs(np.diff(target)) > _MOVED) + 1
+    begin = max(after(trace, events[-1]) if events else 0, int(moved[-1]) if moved.size else 0)
     inside = np.abs(trace[f"unit.{unit}.v_t"] - target) <= band * np.abs(target)
     index = max(begin, last_outside(inside) + 1)
     return float(trace.t[index] - trace.t[begin]) if index < len(trace.t) else None

@@ -54,6 +54,13 @@ def test_target_follows_a_reference_that_an_event_steps_and_not_one_that_a_contr
     np.testing.assert_allclose(target, [1, 1, 1.05, 1.05, 1.05], atol=1e-15)
 
 
+def test_target_is_the_reference_of_the_controller_in_charge():
+    trace = trace_of([0, 1, 2, 3], np.ones(4))
+    own = {"V_ref_G": [1.0, 1.05, 1.05, 1.05], "active": [1.0, 1.0, 0.0, 1.0], "V_ref_GG": [2.0] * 4}
+    columns = trace.columns | {f"controller.mpc.{key}": np.array(value) for key, value in own.items()}
+    np.testing.assert_array_equal(voltage_target(replace(trace, columns=columns), "G"), [1.0, 1.05, 1.0, 1.05])
+
+
 def test_settling_time_of_an_exponential():
     """|e^(-t/T)| falls below 1 % of the final value 1 at T ln(100 * 0.2) for a 0.2 pu dip."""
     t = np.concatenate([[0.0, 1.0], np.linspace(1.0, 11.0, 10001)])

@@ -55,3 +55,11 @@ def test_a_voltage_that_stays_low_never_recovers():
     t = np.linspace(0, 2, 401)
     trace = Trace(t, {"unit.G.v_t": np.where(t < 1, 1.0, 0.9)}, {}, (LogEntry(1.0, "event", "trip"),))
     assert recovery_time(trace, "G", 0.05) is None
+
+
+def test_recovery_counts_from_the_last_step_of_a_controllers_own_reference():
+    t = np.linspace(0.0, 10.0, 1001)
+    aim = np.where(t < 6.0, 1.0, 1.05)
+    v_t = aim - np.where(t < 6.0, 0.0, 0.05 * np.exp(-(t - 6.0) / 0.5))
+    columns = {"unit.G.v_t": v_t, "controller.mpc.V_ref_G": aim, "controller.mpc.active": np.ones(1001)}
+    assert recovery_time(Trace(t, columns, {}), "G", 0.01) == pytest.approx(0.5 * math.log(0.05 / 0.0105), abs=0.011)
