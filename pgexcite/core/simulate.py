@@ -29,6 +29,7 @@ from pgexcite.core.initialise import Initial, initialise
 from pgexcite.core.measurement import Instruments
 from pgexcite.core.memory import Memory, as_arrays, those_under, under
 from pgexcite.core.model import Model, State
+from pgexcite.core.registry import nearest
 from pgexcite.core.result import RunResult
 from pgexcite.core.settings import Settings
 from pgexcite.core.step import Kernel
@@ -70,7 +71,7 @@ class Simulation:
         changes: Sequence[Change] = (),
         controllers: Mapping[str, Controller] | None = None,
     ) -> None:
-        self.settings = settings
+        self.settings, self._system = settings, system
         self.initial: Initial = initialise(system)
         self.model: Model = self.initial.model
         self.kernel = Kernel(self.model, self.initial.state, self.initial.p, settings.compile)
@@ -130,7 +131,18 @@ class Simulation:
 
         Raises:
             KeyError: no such parameter or command.
+            ValueError: the value is not finite, or one that a configuration could not give the parameter either.
         """
+        # Configurations make simulations: at the head of this file the import would go round in a circle.
+        from pgexcite.core.config.checks import adjustable, refusals, siblings
+
+        targets = adjustable(self._system)
+        if not any(path in self.model.index[group] for group in "up") and not switched(path):
+            raise KeyError(f"no parameter or set-point {path!r}; {nearest(path, siblings(path, targets))}")
+        if not math.isfinite(value):
+            raise ValueError(f"{path}: should be a finite number (got {value})")
+        if problems := refusals(targets, path, float(value)):
+            raise ValueError("; ".join(map(str, problems)))
         self._apply(Change(self.state.t, {path: value}, f"{path} set to {value:g}"))
 
     # Running.

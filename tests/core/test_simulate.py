@@ -121,6 +121,22 @@ def test_set_refuses_what_is_not_there_or_cannot_be_set():
     assert sim.trace().log == ()
 
 
+@pytest.mark.parametrize(
+    ("path", "value", "error", "expected"),
+    [
+        ("unit.G2.exciter.vref", 1.0, KeyError, "did you mean 'unit.G2.exciter.v_ref'"),
+        (V_REF, np.nan, ValueError, "should be a finite number"),
+        ("unit.G2.machine.H", 0.0, ValueError, r"unit.G2.machine.H: should be greater than 0 \(got 0.0\)"),
+        ("line.L1.X", np.inf, ValueError, "should be a finite number"),
+    ],
+)
+def test_set_refuses_what_a_configuration_could_not_say(path, value, error, expected):
+    sim = simulation()
+    with pytest.raises(error, match=expected):
+        sim.set(path, value)
+    assert sim.trace().log == ()
+
+
 def test_a_time_constant_of_zero_in_the_middle_of_a_run():
     """Mass becomes zero without a new model; the transducer's state then is its input."""
     sim = simulation(changes=())

@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from pgexcite.core import registry
 from pgexcite.core.config.validate import Collector
 from pgexcite.core.declare import Kind
+from pgexcite.core.errors import Problem
 from pgexcite.core.events import BranchClose, BranchTrip, Event, Fault, HandOver, LoadStep, ParameterStep, boundary
 from pgexcite.core.limiting import mismatches
 from pgexcite.core.roles import TapChanger
@@ -183,15 +184,23 @@ def _check_parameter_step(event: ParameterStep, where: str, system: System, coll
         hint = registry.nearest(event.path, siblings(event.path, targets))
         collect.add(f"{where}.path", "there is no such parameter or set-point", event.path, hint)
         return
-    target = targets[event.path]
-    if target is None or event.value is None:
-        return
+    if event.value is not None:
+        for problem in refusals(targets, event.path, event.value):
+            collect.add(f"{where}.value", f"{event.path} {problem.message}", event.value, problem.hint)
+
+
+def refusals(targets: Mapping[str, tuple[BaseModel, str] | None], path: str, value: float) -> tuple[Problem, ...]:
+    """What the record that a parameter belongs to says against a value; a set-point has none."""
+    target = targets.get(path)
+    if target is None:
+        return ()
     record, name = target
     info = type(record).model_fields[name]
     trial = Collector()
-    trial.validate(type(record), record.model_dump(by_alias=True) | {info.alias or name: event.value}, event.path)
-    for problem in trial.problems:
-        collect.add(f"{where}.value", f"{event.path} {problem.message}", event.value, problem.hint)
+    trial.validate(
+        type(record), record.model_dump(by_alias=True) | {info.alias or name: value}, path.rpartition(".")[0]
+    )
+    return tuple(trial.problems)
 
 
 def siblings(path: str, targets: Mapping[str, object]) -> list[str]:
