@@ -249,10 +249,8 @@ class Ladder:
     def _command(self, first: Array) -> Array:
         """What is sent now; with computing delay the plan's first move waits one sample."""
         first = np.clip(first, self.problem.u_min, self.problem.u_max)
-        if not self.problem.delayed:
-            return first
         now, self._next = self._next, first
-        return now
+        return now if self.problem.delayed else first
 
     def _step_down(self, why: str, notes: list[str]) -> Action:
         if not self.actuator.has_classical:

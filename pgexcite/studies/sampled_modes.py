@@ -23,11 +23,13 @@ from pgexcite.core.trace import Ending
 
 Array = NDArray[np.float64]
 
-CARRIED = ("u", "solver:u", "solver:filter:x")
-"""What of a predictive controller's memory carries the past on: the command in force, and the estimate of a filter.
+CARRIED = ("u", "next", "solver:u", "solver:filter:x")
+"""What of a predictive controller's memory carries the past on: the commands in force and under way, and the estimate of a filter.
 
 The rest stays as it is at rest. A filter's covariance does not depend on what is measured, and while it does not the innovations
 are zero: its gain has no first-order effect. A quadratic program's solution does not depend on the plan it starts from."""
+_OBSERVED = "solver:observer:x"
+"""The estimate of an equivalent. Its filter is not linear and changes its gains; whoever knows it at rest may have it carried."""
 _FORGOTTEN = 1e-6
 """Multipliers below this are gone after a sample; their logarithm says nothing."""
 
@@ -82,7 +84,8 @@ def sampled_modes(
 
     Raises:
         PgexciteError: the simulation is not at a sampling instant, is not at rest, or does not get over the sample; delayed
-            measurements have not yet been taken; measurements are noisy or may be lost, so that there is no one map.
+            measurements have not yet been taken; measurements are noisy or may be lost, so that there is no one map; an estimate
+            of an equivalent is not carried.
     """
     for name, controller in simulation.controllers.items():
         if controller.measurement.random:
@@ -116,6 +119,9 @@ class _Loop:
         self._moving = np.array([model.position("x", path) for path in moving], dtype=int)
         kept, said = self._rest.kept, dict[str, str]()
         for name in simulation.controllers:
+            if f"controller:{name}:{_OBSERVED}" in kept and _OBSERVED not in carried:
+                text = "carries an estimate on that is not among what is carried: this would not be its loop"
+                raise PgexciteError(f"controller.{name}: {text}; see carried ({_OBSERVED!r})")
             said |= {f"controller:{name}:{key}": f"controller.{name}.{key}" for key in carried}
             # Delayed samples of its measurements carry the past on as well.
             said[f"instruments:{name}"] = f"controller.{name}.instruments"
