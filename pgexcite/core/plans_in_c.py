@@ -1,7 +1,9 @@
 """Plans by shooting in C: the whole of a sample's iteration, or of its preparation, in one call.
 
 It is the C that is exported (``shooting.c``), which does what ``pgexcite.core.plans_in_python`` does. It answers for programs with
-nothing but a box, which both solve by pivoting, and where it iterates as Python does.
+nothing but a box, which both solve by pivoting, and where it iterates as Python does. What it does not do is to rescue a step:
+where the fixed order of elimination fails on the way to the next sample, nothing is prepared for it, and with computing delay there
+is no plan.
 """
 
 from __future__ import annotations

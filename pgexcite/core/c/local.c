@@ -1,4 +1,4 @@
-/* Linear predictions around one point of a model: the algorithm of pgexcite.core.local. Goes below rollout.c, ladder.c and horizon.c.
+/* Linear predictions around one point of a model: the algorithm of pgexcite.core.local. Goes below rollout.c, condensed.c and horizon.c.
 
    Expects N_KEPT, how many transitions are kept, and set-points and parameters at the start of the run (U_START, P_START). */
 

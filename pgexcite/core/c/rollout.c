@@ -1,4 +1,5 @@
-/* Predictions with exact sensitivities: the loops of pgexcite.core.prediction and sensing, operation by operation. Goes below step.c and lanes.c.
+/* Predictions with exact sensitivities: the loops of pgexcite.core.prediction and sensing, operation by operation. Goes below step.c
+   and lanes.c.
 
    Expects what pgexcite.core.sensitivity writes: prepare_sensitivity, prepare_commanded, and of a stage, of its slope and of the
    outputs the factors at a point and the derivative along a direction. */

@@ -1,4 +1,4 @@
-/* Plans by shooting: the algorithm of pgexcite.core.shooting. Goes below step.c, rollout.c, ladder.c and horizon.c.
+/* Plans by shooting: the algorithm of pgexcite.core.plans_in_python. Goes below advance.c, chain.c, condensed.c and horizon.c.
 
    Expects N_SELECTED outputs, those of the program. */
 
