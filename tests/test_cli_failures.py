@@ -59,6 +59,22 @@ def test_what_is_no_snapshot_is_refused(tmp_path):
         assert f"{name}: not a snapshot that can be read ({reason}" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("u_max=1.0", "its initial value is outside u_min = -3.2 .. u_max = 1 (got 1.9246)"),
+        ("voltages=['unit.G2.vt']", "measures unit.G2.vt, which does not exist; nearest: unit.G2.v_t"),
+        ("unit=[]", "controller.mpc.unit: should name the unit"),
+        ("options.mod='rti'", "controller.mpc: options.mod: unknown key (got 'rti'); did you mean 'mode'?"),
+        ("options.mode='rtj'", "controller.mpc: options.mode: should be"),
+    ],
+)
+def test_check_finds_what_a_run_would_refuse_of_its_controllers(override, expected):
+    result = call("check", SMIB / "fault_nmpc.toml", "--set", f"controller.mpc.{override}")
+    assert result.exit_code == 3, result.output
+    assert expected in result.stderr
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
     ready = tmp_path / "ready"

@@ -387,3 +387,12 @@ def test_a_dead_band_narrower_than_a_step_is_remarked():
     assert remarks(from_data(transforming())) == []
     told = "transformer.T.tap_changer: a dead band of +-0.004 pu is narrower than a step of 0.01 pu: taps may hunt"
     assert remarks(from_data(transforming(half_deadband=0.004))) == [told]
+
+
+def test_an_event_that_the_step_moves_is_remarked():
+    assert remarks(load(SMIB / "fault_st1a.toml")) == []
+    moved = remarks(load(SMIB / "fault_st1a.toml", ["simulation.h=0.03"]))
+    assert [text.partition(" takes place ")[2] for text in moved] == [
+        "at 1.02 s, the next whole step of simulation.h = 0.03 s, and not at 1 s",
+        "at 1.11 s, the next whole step of simulation.h = 0.03 s, and not at 1.1 s",
+    ]

@@ -103,7 +103,7 @@ def _place(cls: type[BaseModel], loc: Iterable[str | int]) -> tuple[list[str], F
             keys, field = list(fields), fields.get(str(part))
             kind = field.annotation if field else None
         else:  # the name of an entry, its number, or one of the kinds a value may have
-            kind = inner[-1] if inner else None
+            keys, kind = [], inner[-1] if inner else None
     return keys, field
 
 

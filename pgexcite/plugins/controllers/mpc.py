@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from pgexcite.core.config.validate import Collector
 from pgexcite.core.controller import Plant, Session, Surroundings
 from pgexcite.core.declare import par
 from pgexcite.core.errors import ConfigError, Problem, RegistryError
@@ -102,6 +103,13 @@ class MPC(BaseModel):
             raise ValueError(str(cause)) from cause
         return name
 
+    @field_validator("unit")
+    @classmethod
+    def _any_unit(cls, unit: str | tuple[str, ...]) -> str | tuple[str, ...]:
+        if not unit:
+            raise ValueError("should name the unit whose excitation is controlled, or several")
+        return unit
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         for name, n in self._lengths().items():
@@ -136,7 +144,10 @@ class MPC(BaseModel):
         return dict.fromkeys(("Q", "V_ref"), len(self.tracked)) | of_units
 
     def _backend(self) -> Backend:
-        backend: Backend = find("mpc_backend", self.backend).model_validate(dict(self.options))
+        collect = Collector()
+        backend: Backend | None = collect.validate(find("mpc_backend", self.backend), dict(self.options), "options")
+        if backend is None:
+            raise ValueError("; ".join(map(str, collect.problems)))
         return backend
 
     @property
