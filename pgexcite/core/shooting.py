@@ -120,7 +120,14 @@ class Shooting(ABC):
         return self.plans.memory()
 
     def recall(self, memory: Mapping[str, Array]) -> None:
-        """Take up where ``memory`` left off."""
+        """Take up where ``memory`` left off.
+
+        Raises:
+            ValueError: what was prepared is of another problem.
+        """
+        G, shape = memory.get("prepared:G"), (self.problem.N_p, len(self.condensed.outputs()), self.condensed.n)
+        if G is not None and G.shape != shape:
+            raise ValueError(f"what was prepared is of shape {G.shape}, not {shape}")
         self.plans.recall(memory)
 
     def later(self, state: State, t: float, u: Array, p: Array) -> tuple[State, Array] | None:

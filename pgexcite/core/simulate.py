@@ -385,13 +385,19 @@ class Simulation:
             SnapshotError: the file cannot be read or belongs to another model or to other controllers.
         """
         self.restart()
-        memory = Memory(*State.load(path, self.model))
+        memory, own = Memory(*State.load(path, self.model)), self.memory().kept
+        advice = "use the configuration and the version it was taken with"
         for name, running in self._running.items():
             if running.session.memory() and not those_under(f"controller:{name}", memory.kept):
                 raise SnapshotError(f"{path}: holds nothing of the controller {name!r}")
+        for key, value in memory.kept.items():
+            # What is empty at the start may be of any size later.
+            if key in own and own[key].size and own[key].shape != value.shape:
+                raise SnapshotError(f"{path}: {key} is of shape {value.shape}, not {own[key].shape}; {advice}")
         try:
             self.recall(memory)
         except KeyError as missing:
-            text = f"holds no {missing}; use the configuration and the version it was taken with"
-            raise SnapshotError(f"{path}: {text}") from missing
+            raise SnapshotError(f"{path}: holds no {missing}; {advice}") from missing
+        except ValueError as cause:
+            raise SnapshotError(f"{path}: {cause}; {advice}") from cause
         self._record_anew()

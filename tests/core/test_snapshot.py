@@ -100,9 +100,34 @@ def test_an_order_given_at_the_point_is_in_the_snapshot(tmp_path):
 def test_a_snapshot_of_another_controller_is_refused(tmp_path):
     sim = make("nmpc", "never")
     sim.save(tmp_path / "snapshot.npz")
-    other = Simulation(kobbelv(), sim.settings, FAULT.changes(), {"mpc": MPC(unit="G2", backend="equivalent")})
+    other = Simulation(kobbelv(), sim.settings, FAULT.changes(), {"mpc": MPC(unit="G2", N_c=3, backend="equivalent")})
     with pytest.raises(SnapshotError, match="holds no"):
         other.resume(tmp_path / "snapshot.npz")
+
+
+@pytest.mark.parametrize("compiled", ["never", "always"])
+@pytest.mark.parametrize(
+    ("taken", "used"),
+    [
+        ({"N_c": 1}, {"N_c": 3}),
+        ({"N_c": 3}, {"N_c": 1}),
+        ({"N_p": 5}, {"N_p": 8}),
+        ({"N_p": 1}, {"N_p": 8}),
+        ({"backend": "linear"}, {"backend": "linear", "known_delay": 1}),
+        ({"backend": "equivalent", "known_delay": 1}, {"backend": "equivalent"}),
+    ],
+)
+def test_a_snapshot_of_another_configuration_is_refused(tmp_path, taken, used, compiled):
+    """What broadcasts would be taken up without a word, and a delay not be predicted over."""
+    sims = [
+        Simulation(kobbelv(), Settings(0.8, 0.005, compile=compiled), (), {"mpc": MPC(unit="G2", **options)})
+        for options in (taken, used)
+    ]
+    sims[0].run(until=0.1)
+    sims[0].save(tmp_path / "snapshot.npz")
+    with pytest.raises(SnapshotError, match=r"of shape .* use the configuration"):
+        sims[1].resume(tmp_path / "snapshot.npz")
+    sims[0].resume(tmp_path / "snapshot.npz")
 
 
 def test_a_snapshot_of_another_model_is_refused(tmp_path):
