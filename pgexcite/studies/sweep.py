@@ -31,9 +31,11 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
-from collections.abc import Callable, Mapping, Sequence
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -262,6 +264,21 @@ def _collect(futures: Mapping[Future[dict[str, Any]], Case], keep: Callable[[Cas
         keep(futures[future], future.result())
 
 
+@contextmanager
+def _pool(workers: int) -> Iterator[Executor]:
+    """A pool of fresh processes. Interrupted, it begins no further case: its own way is to run all that wait, first.
+
+    An interrupt from a terminal reaches the processes, too, and ends them at once.
+    """
+    context, ends = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_DFL)
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=signal.signal, initargs=ends) as pool:
+        try:
+            yield pool
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
 def _run_locally(pending: Sequence[Case], workers: int, keep: Callable[[Case, Mapping[str, Any]], None]) -> None:
     """A pool of fresh processes. A pool that breaks is replaced; then cases run one at a time, so that the culprit is known."""
     remaining = {case.key: case for case in pending}
@@ -270,14 +287,13 @@ def _run_locally(pending: Sequence[Case], workers: int, keep: Callable[[Case, Ma
         del remaining[case.key]
         keep(case, figures)
 
-    context = multiprocessing.get_context("spawn")
     try:
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        with _pool(workers) as pool:
             _collect({pool.submit(run_case, case): case for case in pending}, finished)
     except BrokenProcessPool:
         for case in list(remaining.values()):
             try:
-                with ProcessPoolExecutor(1, mp_context=context) as pool:
+                with _pool(1) as pool:
                     finished(case, pool.submit(run_case, case).result())
             except BrokenProcessPool:
                 finished(case, {"error": "the process that ran this case died"})
