@@ -82,7 +82,7 @@ class PlansInPython:
     def prepare(self, u: Array) -> None:
         """Linearise around the plan the next sample will start from, at the state expected then."""
         self._ready(None)
-        if self.options.mode != "rti" or self._from is None or self._plan is None:
+        if self.options.mode != "rti" or self._from is None or self._plan is None or not np.isfinite(u).all():
             return
         state, t, p = self._from
         later = a_sample_later(self.predictor, self.horizons, state, t, u, p)

@@ -158,38 +158,24 @@ def test_plans_of_two_units_in_c_are_those_of_python():
     assert np.ptp(plans.plans, axis=0).min() > 0.01
 
 
-def test_without_a_state_nothing_is_prepared():
-    sim = simulation("one move")
-    plans = watched(sim)
-    sim.run(until=0.1)
-    for each in (plans.acting, plans.watching):
-        assert "prepared:plan" in each.memory()
-        each.lost()
-        each.prepare(np.array([2.0]))
-        assert "prepared:plan" not in each.memory()
-
-
-def test_after_a_sample_that_could_not_be_planned_nothing_is_prepared_from_the_one_before():
+@pytest.mark.parametrize("why", ["no state", "no plan", "recalled", "no command"])
+def test_nothing_is_prepared_from_a_sample_that_does_not_count(why):
     sim = simulation("computing delay")
     plans = watched(sim)
     sim.run(until=0.1)
-    beyond = sim.state.with_(x=1e9 * sim.state.x)
-    for each in (plans.acting, plans.watching):
-        assert each.plan(sim.state, 0.1, sim.p, np.array([2.0])).status.usable
-        assert each.plan(beyond, 0.15, sim.p, np.array([2.0])).status is Status.PREDICTION_FAILED
-        each.prepare(np.array([2.0]))
-        assert "prepared:plan" not in each.memory()
-
-
-def test_what_is_recalled_is_not_prepared_from_a_sample_before():
-    sim = simulation("one move")
-    plans = watched(sim)
-    sim.run(until=0.1)
+    command = np.array([2.0])
     for each in (plans.acting, plans.watching):
         kept = each.memory()
-        assert each.plan(sim.state, 0.1, sim.p, np.array([2.0])).status.usable
-        each.recall({"plan": kept["plan"]})
-        each.prepare(np.array([2.0]))
+        assert "prepared:plan" in kept
+        assert each.plan(sim.state, 0.1, sim.p, command).status.usable
+        if why == "no state":
+            each.lost()
+        elif why == "no plan":
+            beyond = sim.state.with_(x=1e9 * sim.state.x)
+            assert each.plan(beyond, 0.15, sim.p, command).status is Status.PREDICTION_FAILED
+        elif why == "recalled":
+            each.recall({"plan": kept["plan"]})
+        each.prepare(command * np.nan if why == "no command" else command)
         assert "prepared:plan" not in each.memory()
 
 
