@@ -76,6 +76,13 @@ def test_check_finds_what_a_run_would_refuse_of_its_controllers(override, expect
     assert expected in result.stderr
 
 
+def test_latencies_without_a_compiler_are_remarked(tmp_path, monkeypatch):
+    monkeypatch.setattr("pgexcite.core.compiling.compiler", lambda: None)
+    result = call("realtime", SMIB / "fault_nmpc.toml", "--steps", 2, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "note: no C compiler was found" in result.stderr
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
     ready = tmp_path / "ready"

@@ -141,6 +141,7 @@ def realtime(
 ) -> None:
     """Run a scenario by the wall clock, and measure latencies and deadline misses."""
     from pgexcite.cli.running import execute_paced
+    from pgexcite.core.compiling import compiler
     from pgexcite.core.config import load
     from pgexcite.core.realtime import RealtimeOptions
     from pgexcite.core.record import ensure_replaceable
@@ -153,6 +154,10 @@ def realtime(
         options["deadline"] = deadline / 1e3
     directory = out or Path("runs") / config.stem
     ensure_replaceable(directory)
+    if scenario.settings.compile != "never" and compiler() is None:
+        click.echo(
+            "note: no C compiler was found: steps and predictions take several times as long as compiled", err=True
+        )
     chosen = RealtimeOptions(**{key: value for key, value in options.items() if value is not None})
     result = execute_paced(scenario, directory, chosen)
     summary = summarise(result)
