@@ -1,5 +1,6 @@
 """What the system or the person at the terminal refuses: a message and an exit code, no traceback, nothing half written."""
 
+import json
 import os
 import signal
 import subprocess
@@ -102,6 +103,35 @@ def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
     assert process.returncode == 130, stderr
     assert stderr.strip() == "interrupted: no record was written"
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_an_interrupted_paced_run_leaves_a_record_of_what_ran(tmp_path):
+    ready = tmp_path / "ready"
+    program = (
+        "import pathlib, sys\n"
+        "from pgexcite.cli import main\n"
+        "from pgexcite.core import realtime\n"
+        "sleep = realtime._sleep_until\n"
+        "begun = []\n"
+        "def noted(instant):\n"
+        "    begun.append(instant)\n"
+        f"    len(begun) > 5 and pathlib.Path({str(ready)!r}).touch()\n"
+        "    sleep(instant)\n"
+        "realtime._sleep_until = noted\n"
+        "main(sys.argv[1:])\n"
+    )
+    arguments = ["realtime", SMIB / "fault_nmpc.toml", "--set", "simulation.t_end=1e4", "--out", tmp_path / "out"]
+    process = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.PIPE, text=True)
+    while not ready.exists() and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert stderr.strip().endswith("interrupted: the record holds what ran")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["realtime"]["interrupted"]
+    assert 5 <= summary["realtime"]["steps"] < 1000
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")

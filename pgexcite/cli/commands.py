@@ -166,6 +166,9 @@ def realtime(
     else:
         show.summary(scenario.title or config.stem, result.outcome.message, summary, directory)
         show.timing(summary["realtime"])
+    if summary["realtime"]["interrupted"]:
+        click.echo("interrupted: the record holds what ran", err=True)
+        click.get_current_context().exit(EXIT_INTERRUPTED)
     _exit_unless_expected(result.outcome.ending.value, scenario.expect)
 
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -68,6 +70,8 @@ def run_paced(
 ) -> Timing:
     """Run a simulation by the wall clock.
 
+    An interrupt (SIGINT) ends it at the end of its period; a second one is that of the process.
+
     Args:
         simulation: at its start or anywhere in its run.
         progress: called with the simulated time once a second.
@@ -83,8 +87,9 @@ def run_paced(
     steps = options.steps or max(1, (round(simulation.settings.t_end / h) - simulation.state.k) // every)
     with ExitStack() as stack:
         grants = tuple(stack.enter_context(_asked(options)))
+        interrupted = stack.enter_context(_interruptible())
         pace = _Pace(simulation, period, sample, steps, options.keep, progress)
-        pace.run()
+        pace.run(interrupted)
     return Timing(
         period=period,
         sample=sample,
@@ -94,6 +99,7 @@ def run_paced(
         skipped=pace.skipped,
         memory=tuple(pace.memory),
         grants=grants,
+        interrupted=interrupted.is_set(),
     )
 
 
@@ -143,7 +149,7 @@ class _Pace:
         self.memory: list[tuple[int, float]] = []
         self.done = self.skipped = 0
 
-    def run(self) -> None:
+    def run(self, interrupted: threading.Event) -> None:
         simulation, period = self._simulation, self._period
         every, h = simulation.sampling, simulation.settings.h
         look = max(1, self._steps // _LOOKS)
@@ -161,7 +167,7 @@ class _Pace:
             for times, value in zip(self.ms.values(), measured, strict=True):
                 times[j] = 1e3 * value
             self.done = j + 1
-            if outcome.ending.value != "completed":
+            if outcome.ending.value != "completed" or interrupted.is_set():
                 break
             if self._keep and j % _FORGET_EVERY == 0:
                 simulation.forget(simulation.state.t - self._keep)
@@ -197,6 +203,26 @@ def resident_memory() -> float | None:
     except OSError:
         return None
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """An event that the first interrupt sets. Only the main thread may say what an interrupt does."""
+    interrupted, before = threading.Event(), signal.getsignal(signal.SIGINT)
+    # What was installed from elsewhere than Python could not be put back.
+    if before is None or threading.current_thread() is not threading.main_thread():
+        yield interrupted
+        return
+
+    def first(_: int, __: object) -> None:
+        interrupted.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, first)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

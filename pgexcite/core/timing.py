@@ -53,6 +53,7 @@ class Timing:
         skipped: periods that went by without a sample, because an earlier one took longer than its own and theirs.
         memory: resident memory now and then, as ``(period, MiB)``; empty where the system does not tell.
         grants: options asked for.
+        interrupted: whether the run was ended by an interrupt.
     """
 
     period: float
@@ -63,6 +64,7 @@ class Timing:
     skipped: int
     memory: tuple[tuple[int, float], ...]
     grants: tuple[Grant, ...]
+    interrupted: bool = False
 
     @property
     def missed(self) -> int:
@@ -82,6 +84,7 @@ class Timing:
             "sample": self.sample,
             "deadline": self.deadline,
             "steps": steps,
+            "interrupted": self.interrupted,
             "missed": self.missed,
             "miss_rate": self.missed / (steps + self.skipped) if steps else None,
             "skipped": self.skipped,
