@@ -92,6 +92,8 @@ class Planner:
         settings = replace(scenario.settings, compile=compiled)
         simulation = Simulation(scenario.system, settings, scenario.changes, scenario.controllers)
         self.solver: Any = simulation.sessions["mpc"].solver
+        # Its plans are made in C as a whole; here the prediction is measured by itself as well.
+        self.solver.predictor.make_ready()
         # The run without the controller: its commands are where they were.
         free = Simulation(scenario.system, settings, scenario.changes, {})
         free.run()
