@@ -84,54 +84,58 @@ def test_latencies_without_a_compiler_are_remarked(tmp_path, monkeypatch):
     assert "note: no C compiler was found" in result.stderr
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
-    ready = tmp_path / "ready"
-    program = (
-        "import pathlib, sys\n"
-        "from pgexcite.cli import main, running\n"
-        "run = running.Simulation.run\n"
-        f"running.Simulation.run = lambda *a, **k: (pathlib.Path({str(ready)!r}).touch(), run(*a, **k))[1]\n"
-        "main(sys.argv[1:])\n"
-    )
-    arguments = ["run", SMIB / "fault_nmpc.toml", "--set", "simulation.t_end=1e6", "--out", tmp_path / "out"]
-    process = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.PIPE, text=True)
+def interrupted(program, ready, *arguments):
+    """What is said on standard error by a program that is interrupted once it has made this file."""
+    command = [
+        sys.executable,
+        "-c",
+        f"import pathlib, sys\nready = pathlib.Path({str(ready)!r})\n{program}",
+        *arguments,
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     while not ready.exists() and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130, stderr
-    assert stderr.strip() == "interrupted: no record was written"
+    return stderr.strip()
+
+
+RUN = """
+from pgexcite.cli import main, running
+run = running.Simulation.run
+running.Simulation.run = lambda *a, **k: (ready.touch(), run(*a, **k))[1]
+main(sys.argv[1:])
+"""
+PACED = """
+from pgexcite.cli import main
+from pgexcite.core import realtime
+sleep, begun = realtime._sleep_until, []
+def noted(instant):
+    begun.append(instant)
+    if len(begun) > 5:
+        ready.touch()
+    sleep(instant)
+realtime._sleep_until = noted
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
+    endless = ["run", SMIB / "fault_nmpc.toml", "--set", "simulation.t_end=1e6", "--out", tmp_path / "out"]
+    assert interrupted(RUN, tmp_path / "ready", *endless) == "interrupted: no record was written"
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_an_interrupted_paced_run_leaves_a_record_of_what_ran(tmp_path):
-    ready = tmp_path / "ready"
-    program = (
-        "import pathlib, sys\n"
-        "from pgexcite.cli import main\n"
-        "from pgexcite.core import realtime\n"
-        "sleep = realtime._sleep_until\n"
-        "begun = []\n"
-        "def noted(instant):\n"
-        "    begun.append(instant)\n"
-        f"    len(begun) > 5 and pathlib.Path({str(ready)!r}).touch()\n"
-        "    sleep(instant)\n"
-        "realtime._sleep_until = noted\n"
-        "main(sys.argv[1:])\n"
-    )
-    arguments = ["realtime", SMIB / "fault_nmpc.toml", "--set", "simulation.t_end=1e4", "--out", tmp_path / "out"]
-    process = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.PIPE, text=True)
-    while not ready.exists() and process.poll() is None:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130, stderr
-    assert stderr.strip().endswith("interrupted: the record holds what ran")
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["realtime"]["interrupted"]
-    assert 5 <= summary["realtime"]["steps"] < 1000
+    endless = ["realtime", SMIB / "fault_nmpc.toml", "--set", "simulation.t_end=1e4", "--out", tmp_path / "out"]
+    said = interrupted(PACED, tmp_path / "ready", *endless)
+    assert said.endswith("interrupted: the record holds what ran")
+    timing = json.loads((tmp_path / "out" / "summary.json").read_text())["realtime"]
+    assert timing["interrupted"]
+    assert 5 <= timing["steps"] < 1000
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
